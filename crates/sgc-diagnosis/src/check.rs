@@ -24,6 +24,9 @@ use crate::names;
 /// The extension of fleet files.
 pub const FLEET_EXTENSION: &str = "fleet";
 
+/// The heading of a warning.
+pub const WARNING: &str = "warning";
+
 /// Returns rows that describe the node, and warnings. `file` is the configuration.
 pub fn summary(
     config: &Config,
@@ -129,13 +132,13 @@ pub fn summary(
     }
     if let Some(metrics) = &config.metrics {
         rows.push(vec!["metrics".to_owned(), format!("http://{}/metrics", metrics.listen)]);
-        rows.extend(metrics.warnings().into_iter().map(|warning| vec!["warning".to_owned(), warning]));
+        rows.extend(metrics.warnings().into_iter().map(|warning| vec![WARNING.to_owned(), warning]));
     }
     rows.extend(
-        sgc_node::expiry_warning(identity, unix_now()).map(|warning| vec!["warning".to_owned(), warning]),
+        sgc_node::expiry_warning(identity, unix_now()).map(|warning| vec![WARNING.to_owned(), warning]),
     );
     if let Some(alert) = clock_alert(identity, unix_now()) {
-        rows.push(vec!["warning".to_owned(), format!("{alert}. The node starts and waits: {}", alert.fix())]);
+        rows.push(vec![WARNING.to_owned(), format!("{alert}. The node starts and waits: {}", alert.fix())]);
     }
     if let Some(security) = config.ros.as_ref().and_then(|ros| ros.security.as_ref()) {
         let enclave = sgc_node::enclave_of(security);
@@ -151,23 +154,23 @@ pub fn summary(
         let exposed = enclave.exposed_key().map(|key| {
             format!("{}: others can read it, and it is a private key: chmod 600 it", key.display())
         });
-        rows.extend(unusable.or(exposed).map(|text| vec!["warning".to_owned(), text]));
+        rows.extend(unusable.or(exposed).map(|text| vec![WARNING.to_owned(), text]));
     }
     if let Some(ros) = &config.ros {
         let reaches_out = ros.discovery == DiscoveryRange::Subnet && ros.cyclonedds_uri.is_none();
         let alone = reaches_out && !sgc_dds::has_outward_address();
         let alone = alone.then_some(Alert::LocalNetworkAlone);
-        rows.extend(alone.map(|alert| vec!["warning".to_owned(), format!("{alert}: {}", alert.fix())]));
+        rows.extend(alone.map(|alert| vec![WARNING.to_owned(), format!("{alert}: {}", alert.fix())]));
         for alert in discovery_server::alerts(environment) {
-            rows.push(vec!["warning".to_owned(), format!("{alert}: {}", alert.fix())]);
+            rows.push(vec![WARNING.to_owned(), format!("{alert}: {}", alert.fix())]);
         }
     }
     for unknown in unknown_members(config, identity, file) {
-        rows.push(vec!["warning".to_owned(), unknown.to_string()]);
+        rows.push(vec![WARNING.to_owned(), unknown.to_string()]);
     }
     let state = sgc_node::state_dir(config, identity.node_name().as_str());
     if let Some(Err(error)) = state.as_deref().map(sgc_node::check_state_dir) {
-        rows.push(vec!["warning".to_owned(), format!("{error}; the node does not start like that")]);
+        rows.push(vec![WARNING.to_owned(), format!("{error}; the node does not start like that")]);
     }
     Ok(rows)
 }
@@ -217,7 +220,7 @@ fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
     }
     for warning in gateway.warnings().into_iter().chain(sgc_node::gateway_expiry_warning(gateway, unix_now()))
     {
-        row("warning", warning);
+        row(WARNING, warning);
     }
     rows
 }

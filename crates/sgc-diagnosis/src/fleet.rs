@@ -1,6 +1,7 @@
 //! The fleet as an observer sees it: what its nodes report, and the tables of `sgc fleet status`.
 //!
-//! Reports come from other machines. Callers remove control characters from the lines before they print them.
+//! Reports come from other machines. Callers remove control characters from the lines (`Line::cleaned`) before they print
+//! them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -10,6 +11,7 @@ use serde::Serialize;
 use sgc_node::admin::report::{NodeReport, ReportLink, ReportMember, ReportTopic};
 use sgc_node::admin::{AdminRequest, REPORT_NODES_MAX, ReportAnswer, ReportRequest};
 use sgc_process::output;
+use sgc_process::style::{self, Line, Tone, Toned};
 use sgc_wire::UnixMillis;
 
 use crate::ask::{answer, ask};
@@ -161,18 +163,16 @@ impl FleetStatus {
 
     /// Returns the overview: a row for each node, then what needs attention. `before` is an earlier look, from which
     /// rates are computed.
-    pub fn overview(&self, before: Option<&Self>) -> Vec<String> {
+    pub fn overview(&self, before: Option<&Self>) -> Vec<Line> {
         let rate = if before.is_some() { "messages/s" } else { "messages" };
         let head = ["node", "state", "up for", "version", "certificate", "secret", "links", "topics", rate];
         let rows = self.nodes.iter().map(|node| self.row(node, before));
-        let table: Vec<_> = std::iter::once(head.map(str::to_owned).to_vec()).chain(rows).collect();
-        let mut lines = vec![self.summary(), String::new()];
-        lines.extend(output::columns(&table));
+        let table: Vec<_> = std::iter::once(head.map(Toned::from).to_vec()).chain(rows).collect();
+        let mut lines = vec![Line::from(self.summary()), Line::default()];
+        lines.extend(style::columns(&table));
         if self.members_omitted > 0 {
-            lines.push(format!(
-                "{} more are not shown: name them",
-                output::several(self.members_omitted as u64, "node")
-            ));
+            let omitted = output::several(self.members_omitted as u64, "node");
+            lines.push(format!("{omitted} more are not shown: name them").into());
         }
         lines.extend(self.attention_lines());
         lines
@@ -205,35 +205,36 @@ impl FleetStatus {
         Recipients::new(nodes, is_complete, reports.filter_map(|report| report.rights.as_ref()))
     }
 
-    fn attention_lines(&self) -> Vec<String> {
+    fn attention_lines(&self) -> Vec<Line> {
         let mut lines = Vec::new();
         for FaultOfNodes { nodes, what, fix } in self.attention() {
-            lines.push(format!("  {}: {what}", listed(&nodes)));
+            let nodes = format!("  {}: ", listed(&nodes));
+            lines.push(Line::new([nodes.into(), Toned::new(Tone::Attention, what)]));
             if !fix.is_empty() {
-                lines.push(format!("    {fix}"));
+                lines.push(format!("    {fix}").into());
             }
         }
         if !lines.is_empty() {
-            lines.splice(0..0, [String::new(), "Needs attention:".to_owned()]);
+            lines.splice(0..0, [Line::default(), "Needs attention:".into()]);
         }
         lines
     }
 
     /// Returns everything that a node reports, under its name; nothing without a report.
-    pub fn details(&self, node: &FleetNode) -> Vec<String> {
+    pub fn details(&self, node: &FleetNode) -> Vec<Line> {
         let Some(report) = &node.report else { return Vec::new() };
-        let mut lines = vec![String::new(), format!("{}:", node.name)];
+        let mut lines = vec![Line::default(), format!("{}:", node.name).into()];
         let mut section = |title: &str, head: &[&str], rows: Vec<Vec<String>>, omitted: usize| {
             if rows.is_empty() {
-                lines.push(format!("  {title}: none"));
+                lines.push(format!("  {title}: none").into());
                 return;
             }
             let head = head.iter().map(|h| (*h).to_owned()).collect();
             let table: Vec<_> = std::iter::once(head).chain(rows).collect();
-            lines.push(format!("  {title}:"));
-            lines.extend(output::columns(&table).into_iter().map(|line| format!("    {line}")));
+            lines.push(format!("  {title}:").into());
+            lines.extend(output::columns(&table).into_iter().map(|line| Line::from(line).indented("    ")));
             if omitted > 0 {
-                lines.push(format!("    and {omitted} more"));
+                lines.push(format!("    and {omitted} more").into());
             }
         };
         let links = report.links.iter().map(|link| self.link_row(link)).collect();
@@ -287,9 +288,9 @@ impl FleetStatus {
         }
     }
 
-    fn row(&self, node: &FleetNode, before: Option<&Self>) -> Vec<String> {
+    fn row(&self, node: &FleetNode, before: Option<&Self>) -> Vec<Toned> {
         let member = node.member.as_ref();
-        let dash = || "–".to_owned();
+        let dash = || Toned::from("–");
         let until = node.report.as_ref().map(|report| report.certificate_until_ms);
         let until = until.or(member.and_then(|member| member.expires_ms));
         let generation = match (&node.report, member) {
@@ -297,23 +298,28 @@ impl FleetStatus {
             (None, Some(member)) => Some(member.generation).filter(|generation| *generation > 0),
             (None, None) => None,
         };
+        let tone = match node.report {
+            Some(_) => Tone::Good,
+            None if node.is_revoked() => Tone::Plain,
+            None => Tone::Bad,
+        };
         let mut row = vec![
-            node.name.clone(),
-            self.state(node),
-            node.report.as_ref().map_or_else(dash, |report| duration(report.uptime_s)),
-            node.report.as_ref().map_or_else(dash, |report| report.version.clone()),
+            node.name.as_str().into(),
+            Toned::new(tone, self.state(node)),
+            node.report.as_ref().map_or_else(dash, |report| duration(report.uptime_s).into()),
+            node.report.as_ref().map_or_else(dash, |report| report.version.as_str().into()),
             until.map_or_else(dash, |until| self.ends(until)),
-            generation.map_or_else(dash, |generation| generation.to_string()),
+            generation.map_or_else(dash, |generation| generation.to_string().into()),
         ];
         let Some(report) = &node.report else {
             row.extend([dash(), dash(), dash()]);
             return row;
         };
-        row.push(self.links(report));
-        row.push((report.topics.len() + report.topics_omitted).to_string());
+        row.push(self.links(report).into());
+        row.push((report.topics.len() + report.topics_omitted).to_string().into());
         row.push(match before {
-            None => messages(report).to_string(),
-            Some(before) => self.rate(node, before).map_or_else(dash, |rate| format!("{rate:.1}")),
+            None => messages(report).to_string().into(),
+            Some(before) => self.rate(node, before).map_or_else(dash, |rate| format!("{rate:.1}").into()),
         });
         row
     }
@@ -334,10 +340,10 @@ impl FleetStatus {
         }
     }
 
-    fn ends(&self, until_ms: u64) -> String {
+    fn ends(&self, until_ms: u64) -> Toned {
         match until_ms.checked_sub(self.time_ms) {
-            None | Some(0) => "ended".to_owned(),
-            Some(left) => format!("{} left", duration(left / 1000)),
+            None | Some(0) => Toned::new(Tone::Bad, "ended"),
+            Some(left) => format!("{} left", duration(left / 1000)).into(),
         }
     }
 
@@ -513,6 +519,10 @@ mod tests {
 
     use super::*;
 
+    fn plain(lines: &[Line]) -> Vec<String> {
+        lines.iter().map(ToString::to_string).collect()
+    }
+
     const NOW: u64 = 1_795_000_000_000;
     const HOUR: u64 = 3_600_000;
 
@@ -586,7 +596,7 @@ mod tests {
             error_of("cloud", "not in reach"),
             error_of("lost", "not in reach"),
         ]);
-        let lines = fleet.overview(None);
+        let lines = plain(&fleet.overview(None));
         let summary = "5 nodes, 2 here, 2 without a report, 1 revoked; 1 of them needs attention";
         assert_eq!(lines[0], summary);
         let row = |name: &str| lines.iter().find(|line| line.starts_with(name)).cloned().unwrap_or_default();
@@ -612,7 +622,7 @@ mod tests {
     fn nodes_with_the_same_fault_share_a_line_and_many_stuck_topics_are_counted() {
         let members = (0..6).map(|n| member(&format!("arm-{n}"), &n.to_string(), false)).collect();
         let answers = (0..6).map(|n| error_of(&format!("arm-{n}"), "not in reach")).collect();
-        let absent = FleetStatus::new(UnixMillis(NOW), members, answers, &[]).overview(None);
+        let absent = plain(&FleetStatus::new(UnixMillis(NOW), members, answers, &[]).overview(None));
         let expected = "  arm-0, arm-1, arm-2, arm-3 and 2 more: not in reach";
         assert!(absent.iter().any(|line| line == expected), "{absent:#?}");
         let mut stuck = report("desk", &[]);
@@ -623,7 +633,7 @@ mod tests {
             ..ReportTopic::default()
         };
         stuck.topics = (0..6).map(topic).collect();
-        let lines = fleet(vec![answer_of(stuck)]).overview(None).join("\n");
+        let lines = plain(&fleet(vec![answer_of(stuck)]).overview(None)).join("\n");
         assert!(lines.contains("desk: /t1: robot has gone\n    `sgc fleet why NODE:/TOPIC`"), "{lines}");
         assert!(lines.contains("desk: 2 more of its topics are stuck") && !lines.contains("/t0"), "{lines}");
         // The owner says that its publisher does not run, or is absent and has a fault of its own.
@@ -673,7 +683,7 @@ mod tests {
             ),
             (NodeReport { problems: vec!["/a: types differ".into()], ..sound.clone() }, "/a: types differ"),
         ] {
-            let lines = fleet(vec![answer_of(faulty), answer_of(report("desk", &[]))]).overview(None);
+            let lines = plain(&fleet(vec![answer_of(faulty), answer_of(report("desk", &[]))]).overview(None));
             assert!(lines.iter().any(|line| line.contains(what)), "{what:?} is not in {lines:#?}");
         }
         // A router that has dialled this node is no fault, nor is what was counted since the start.
@@ -683,7 +693,7 @@ mod tests {
             certificate_until_ms: NOW + 20 * 24 * HOUR,
             ..sound
         };
-        let lines = fleet(vec![answer_of(well)]).overview(None);
+        let lines = plain(&fleet(vec![answer_of(well)]).overview(None));
         assert!(lines[0].ends_with("nothing needs attention"), "{lines:#?}");
     }
 
@@ -697,7 +707,7 @@ mod tests {
             answer_of(report)
         };
         let now = fleet(vec![later("arm", 520, 7202), later("desk", 3, 1)]);
-        let lines = now.overview(Some(&before));
+        let lines = plain(&now.overview(Some(&before)));
         let last = |name: &str| {
             let line = lines.iter().find(|line| line.starts_with(name)).cloned().unwrap_or_default();
             line.rsplit("  ").next().unwrap_or_default().to_owned()
@@ -738,7 +748,7 @@ mod tests {
         let fleet = fleet(vec![answer_of(report), error_of("desk", "not in reach")]);
         let of = |name: &str| {
             let node = fleet.nodes.iter().find(|node| node.name == name);
-            node.map(|node| fleet.details(node).join("\n")).unwrap_or_default()
+            node.map(|node| plain(&fleet.details(node)).join("\n")).unwrap_or_default()
         };
         let arm = of("arm");
         for part in [

@@ -10,6 +10,7 @@ use serde::Deserialize;
 use sgc_node::admin::AdminRequest;
 use sgc_node::alerts::Alert;
 use sgc_process::output;
+use sgc_process::style::{self, Line, Tone, Toned};
 
 use crate::ask::{ANSWER_MAX, ask};
 use crate::error::DiagnosisError;
@@ -171,22 +172,25 @@ pub fn parse(socket: &Path, text: &str) -> Result<Status, DiagnosisError> {
 
 impl Status {
     /// Returns the lines of `sgc status`.
-    pub fn lines(&self) -> Vec<String> {
-        let mut lines =
-            vec![format!("{}: sgc {}, up for {}", self.node, self.version, duration(self.uptime_s))];
-        let mut section = |title: &str, head: &[&str], rows: Vec<Vec<String>>| {
-            lines.push(String::new());
+    pub fn lines(&self) -> Vec<Line> {
+        let head = format!("{}: sgc {}, up for {}", self.node, self.version, duration(self.uptime_s));
+        let mut lines = vec![Line::from(head)];
+        let mut section = |title: &str, head: &[&str], rows: Vec<Vec<Toned>>| {
+            lines.push(Line::default());
             if rows.is_empty() {
-                lines.push(format!("{title}: none"));
+                lines.push(format!("{title}: none").into());
                 return;
             }
-            lines.push(format!("{title}:"));
-            let head = head.iter().map(|h| (*h).to_owned()).collect();
+            lines.push(format!("{title}:").into());
+            let head = head.iter().map(|h| Toned::from(*h)).collect();
             let table: Vec<_> = std::iter::once(head).chain(rows).collect();
-            lines.extend(output::columns(&table).into_iter().map(|line| format!("  {line}")));
+            lines.extend(style::columns(&table).into_iter().map(|line| line.indented("  ")));
         };
         if !self.alerts.is_empty() {
-            let rows = self.alerts.iter().map(|alert| vec![alert.to_string(), alert.fix().to_owned()]);
+            let rows = self.alerts.iter().map(|alert| {
+                let tone = if alert.stops_all() { Tone::Bad } else { Tone::Attention };
+                vec![Toned::new(tone, alert.to_string()), alert.fix().into()]
+            });
             section("Needs attention", &["what", "do"], rows.collect());
         }
         section(
@@ -217,7 +221,7 @@ impl Status {
             self.routes.iter().map(Route::row).collect(),
         );
         if !self.problems.is_empty() {
-            let rows = self.problems.iter().map(|problem| vec![problem.clone()]);
+            let rows = self.problems.iter().map(|problem| vec![Toned::new(Tone::Attention, problem)]);
             section("What is wrong", &["problem"], rows.collect());
         }
         section(
@@ -226,7 +230,10 @@ impl Status {
             self.names.iter().map(NameTraffic::row).collect(),
         );
         let counts = |counts: &BTreeMap<String, u64>, meaning: fn(&str) -> String| {
-            counts.iter().map(|(key, n)| vec![key.clone(), n.to_string(), meaning(key)]).collect()
+            counts
+                .iter()
+                .map(|(key, n)| vec![key.into(), n.to_string().into(), meaning(key).into()])
+                .collect()
         };
         let head = ["reason", "count", "meaning"];
         section("Drops", &head, counts(&self.drops, refusals::drop_meaning));
@@ -240,102 +247,121 @@ impl Status {
             if !gateway.refused.is_empty() {
                 section("Refused there", &head, counts(&gateway.refused, refusals::gateway_meaning));
             }
-            lines.push(format!("  at {}; {} topics read", gateway.listen.join(", "), gateway.readers));
+            lines.push(format!("  at {}; {} topics read", gateway.listen.join(", "), gateway.readers).into());
             if let Some(GatewayCertificate { pin, names, until }) = &gateway.certificate {
                 let until = sgc_wire::UnixMillis(*until);
-                lines.push(format!("  certificate {pin} for {}, until {until}", names.join(", ")));
+                lines.push(format!("  certificate {pin} for {}, until {until}", names.join(", ")).into());
             }
         }
         let RouterSize { nodes, names, routed_names, branches } = self.router;
-        lines.push(String::new());
+        lines.push(Line::default());
         if self.local_network_reopened > 0 {
             let times = self.local_network_reopened;
-            lines.push(format!(
-                "Local network: opened again after this host's addresses changed, so often: {times}"
-            ));
+            lines.push(
+                format!("Local network: opened again after this host's addresses changed, so often: {times}")
+                    .into(),
+            );
         }
-        lines.extend(self.metrics.iter().map(|url| format!("Metrics: {url}")));
-        lines.push(format!(
-            "Router: {} and {} known, {routed_names} with a route; branches: {branches}",
-            output::several(nodes as u64, "node"),
-            output::several(names, "name"),
-        ));
+        lines.extend(self.metrics.iter().map(|url| format!("Metrics: {url}").into()));
+        let (nodes, names) = (output::several(nodes as u64, "node"), output::several(names, "name"));
+        let known =
+            format!("Router: {nodes} and {names} known, {routed_names} with a route; branches: {branches}");
+        lines.push(known.into());
         lines
     }
 }
 
 impl GatewayClient {
-    fn row(&self) -> Vec<String> {
+    fn row(&self) -> Vec<Toned> {
         let since = sgc_wire::UnixMillis(self.since).to_string();
-        vec![self.name.clone(), self.protocol.clone(), self.address.clone(), since]
+        vec![
+            self.name.as_str().into(),
+            self.protocol.as_str().into(),
+            self.address.as_str().into(),
+            since.into(),
+        ]
     }
 }
 
 impl Link {
-    fn row(&self) -> Vec<String> {
+    fn row(&self) -> Vec<Toned> {
+        // The cost that silence adds serves routing and means nothing to a reader.
+        let cost = match self.silent {
+            true => Toned::new(Tone::Bad, "silent"),
+            false => output::millis(self.cost.into()).into(),
+        };
         vec![
-            self.peer.chars().take(8).collect(),
-            self.remote.clone(),
-            output::millis(self.rtt_us),
-            // The cost that silence adds serves routing and means nothing to a reader.
-            if self.silent { "silent".into() } else { output::millis(self.cost.into()) },
-            output::bytes(self.sent_bytes),
-            output::bytes(self.received_bytes),
-            self.url.clone().unwrap_or_default(),
+            self.short_peer(),
+            self.remote.as_str().into(),
+            output::millis(self.rtt_us).into(),
+            cost,
+            output::bytes(self.sent_bytes).into(),
+            output::bytes(self.received_bytes).into(),
+            self.url.as_deref().unwrap_or_default().into(),
         ]
     }
 
-    fn over_row(&self) -> Vec<String> {
-        let peer = self.peer.chars().take(8).collect();
-        vec![peer, self.peer_slowed.to_string(), self.peer_dropped.to_string()]
+    fn over_row(&self) -> Vec<Toned> {
+        vec![self.short_peer(), self.peer_slowed.to_string().into(), self.peer_dropped.to_string().into()]
+    }
+
+    fn short_peer(&self) -> Toned {
+        self.peer.chars().take(8).collect::<String>().into()
     }
 }
 
 impl Router {
-    fn row(&self, links: &[Link]) -> Vec<String> {
-        let is_silent = links.iter().any(|link| link.silent && link.url.is_some() && link.url == self.at);
+    fn row(&self, links: &[Link]) -> Vec<Toned> {
+        let is_up = |link: &&Link| link.url.is_some() && link.url == self.at;
+        let link = links.iter().find(is_up);
+        let state = match (self.again_in_s, link) {
+            (Some(s), _) => Toned::new(Tone::Bad, format!("{} in {}", self.state, duration(s))),
+            (None, Some(link)) if link.silent => Toned::new(Tone::Bad, format!("{}, silent", self.state)),
+            (None, Some(_)) => Toned::new(Tone::Good, &self.state),
+            (None, None) if self.failures > 0 => Toned::new(Tone::Bad, &self.state),
+            (None, None) => self.state.as_str().into(),
+        };
         vec![
-            self.router.clone(),
-            self.found_by.clone(),
-            self.at.clone().unwrap_or_default(),
-            match self.again_in_s {
-                Some(s) => format!("{} in {}", self.state, duration(s)),
-                None if is_silent => format!("{}, silent", self.state),
-                None => self.state.clone(),
-            },
-            self.last_failure.clone().unwrap_or_default(),
+            self.router.as_str().into(),
+            self.found_by.as_str().into(),
+            self.at.as_deref().unwrap_or_default().into(),
+            state,
+            self.last_failure.as_deref().unwrap_or_default().into(),
         ]
     }
 }
 
 impl Router {
-    fn second_row(&self) -> Option<Vec<String>> {
-        let why = self.why_not_first.clone()?;
-        Some(vec![self.router.clone(), self.at.clone().unwrap_or_default(), why])
+    fn second_row(&self) -> Option<Vec<Toned>> {
+        let why = self.why_not_first.as_deref()?;
+        let at = self.at.as_deref().unwrap_or_default();
+        Some(vec![self.router.as_str().into(), at.into(), Toned::new(Tone::Attention, why)])
     }
 }
 
 impl Route {
-    fn row(&self) -> Vec<String> {
+    fn row(&self) -> Vec<Toned> {
+        let state = match self.compressed {
+            Some((before, after)) if before > 0 => {
+                format!("{}, compressed to {:.0} %", self.state, 100.0 * after as f64 / before as f64)
+            }
+            _ => self.state.clone(),
+        };
         vec![
-            self.direction.clone(),
-            self.topic.clone(),
-            self.type_name.clone().unwrap_or_else(|| "?".into()),
-            self.owner.clone(),
-            self.messages.to_string(),
-            match self.compressed {
-                Some((before, after)) if before > 0 => {
-                    format!("{}, compressed to {:.0} %", self.state, 100.0 * after as f64 / before as f64)
-                }
-                _ => self.state.clone(),
-            },
+            self.direction.as_str().into(),
+            self.topic.as_str().into(),
+            self.type_name.as_deref().unwrap_or("?").into(),
+            self.owner.as_str().into(),
+            self.messages.to_string().into(),
+            state.into(),
         ]
     }
 }
 
 impl NameTraffic {
-    fn row(&self) -> Vec<String> {
-        vec![self.name.clone(), self.packets.to_string(), output::bytes(self.bytes), self.dropped.to_string()]
+    fn row(&self) -> Vec<Toned> {
+        let (packets, dropped) = (self.packets.to_string(), self.dropped.to_string());
+        vec![self.name.as_str().into(), packets.into(), output::bytes(self.bytes).into(), dropped.into()]
     }
 }
 
@@ -353,6 +379,10 @@ pub(crate) fn duration(seconds: u64) -> String {
 mod tests {
     use super::*;
 
+    fn plain(text: &str) -> Vec<String> {
+        parse(Path::new("x"), text).unwrap().lines().iter().map(ToString::to_string).collect()
+    }
+
     #[test]
     fn status_is_shown_in_tables() {
         let text = r#"{"node":"arm-1","version":"0.1.0","uptime_s":75,"new":{},
@@ -363,7 +393,7 @@ mod tests {
             "routes":[{"direction":"share","topic":"/chatter","type":null,"name":null,"owner":"arm-1",
                        "state":"waiting for a publisher"}],
             "names":[],"drops":{"hop_limit":3},"refused":{},"router":{"nodes":3,"names":1,"routed_names":0,"branches":2}}"#;
-        let lines = parse(Path::new("x"), text).unwrap().lines();
+        let lines = plain(text);
         let expected = [
             "arm-1: sgc 0.1.0, up for 1 min 15 s",
             "",
@@ -402,7 +432,7 @@ mod tests {
             "routers":[{"router":"quic://localhost:7447","found_by":"static","at":"quic://localhost:7447","state":"linked"},
                        {"router":"quic://localhost:7448","found_by":"static","at":"quic://localhost:7448","state":"linked"}],
             "routes":[],"names":[],"drops":{},"refused":{},"router":{"nodes":3,"names":1,"routed_names":0,"branches":2}}"#;
-        let lines = parse(Path::new("x"), text).unwrap().lines();
+        let lines = plain(text);
         let state = |router: &str| lines.iter().find(|line| line.starts_with(router)).unwrap().trim_end();
         assert!(state("  quic://localhost:7447").ends_with("linked, silent"));
         assert!(state("  quic://localhost:7448").ends_with("linked"));

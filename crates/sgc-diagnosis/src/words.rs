@@ -6,6 +6,7 @@ use std::fmt;
 use serde::ser::{Serialize, SerializeStruct as _, Serializer};
 use sgc_node::graph::Interface;
 use sgc_process::output;
+use sgc_process::style::{Line, Tone, Toned};
 
 use crate::finding::{
     Direction, Finding, Hop, LinkFinding, LocalFinding, NameFinding, NodeFinding, QosMismatch, Reach,
@@ -37,15 +38,15 @@ impl Step {
     }
 
     /// Returns the lines of `sgc why`: the finding behind a mark, and the advice.
-    pub fn lines(&self) -> Vec<String> {
-        let mark = match self.verdict {
-            Verdict::Fine => '✓',
-            Verdict::Wrong => '✗',
-            Verdict::Unknown => '?',
+    pub fn lines(&self) -> Vec<Line> {
+        let (mark, tone) = match self.verdict {
+            Verdict::Fine => ("✓", Tone::Good),
+            Verdict::Wrong => ("✗", Tone::Bad),
+            Verdict::Unknown => ("?", Tone::Attention),
         };
-        let fix = self.fix().map(|fix| format!("    {fix}"));
-        let lines = [Some(format!("{mark} {}", self.found())), fix];
-        lines.into_iter().flatten().map(|line| output::clean(&line)).collect()
+        let found = Line::new([Toned::new(tone, mark), format!(" {}", self.found()).into()]);
+        let fix = self.fix().map(|fix| Line::from(format!("    {fix}")));
+        [Some(found), fix].into_iter().flatten().map(Line::cleaned).collect()
     }
 }
 

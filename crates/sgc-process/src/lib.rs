@@ -9,6 +9,7 @@ mod error;
 pub mod files;
 pub mod output;
 mod signals;
+pub mod style;
 mod system;
 
 pub use error::ProcessError;

@@ -6,9 +6,10 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
-use sgc_diagnosis::check::summary;
+use sgc_diagnosis::check::{WARNING, summary};
 use sgc_node::config;
 use sgc_process::ProcessError;
+use sgc_process::style::{self, Line, Tone, Toned};
 
 use crate::environment::environment;
 use crate::error::CliError;
@@ -40,9 +41,14 @@ pub(crate) fn check(args: &CheckArgs) -> Result<(), CliError> {
     if args.json {
         return output::line(json(&summary)?);
     }
-    output::line(format!("{what}: no mistakes"))?;
-    for line in output::columns(&summary) {
-        output::line(line)?;
+    Line::new([format!("{what}: ").into(), Toned::new(Tone::Good, "no mistakes")]).print()?;
+    let toned = |row: &Vec<String>| {
+        let tone =
+            if row.first().is_some_and(|heading| heading == WARNING) { Tone::Attention } else { Tone::Plain };
+        row.iter().map(|cell| Toned::new(tone, cell)).collect()
+    };
+    for line in style::columns(&summary.iter().map(toned).collect::<Vec<_>>()) {
+        line.print()?;
     }
     Ok(())
 }

@@ -31,7 +31,7 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), CliError> {
         return output::line(text.trim_end());
     }
     for line in status.lines() {
-        output::line(line)?;
+        line.print()?;
     }
     Ok(())
 }

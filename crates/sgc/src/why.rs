@@ -57,7 +57,7 @@ pub(crate) fn print_steps(steps: &[Step], json: bool) -> Result<ExitCode, CliErr
         output::line(serde_json::to_string(&steps).unwrap_or_default())?;
     } else {
         for line in steps.iter().flat_map(Step::lines) {
-            output::line(line)?;
+            line.print()?;
         }
     }
     Ok(if is_wrong { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })

@@ -685,3 +685,50 @@ fn now() -> UnixMillis {
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
     UnixMillis(since.as_millis() as u64)
 }
+
+/// Beginnings of the escape sequences of a good and of a bad state, and their end.
+const GREEN: &str = "\x1b[32m";
+const RED: &str = "\x1b[31m";
+const RESET: &str = "\x1b[0m";
+
+#[test]
+fn colours_are_for_terminals_and_on_request() {
+    let place = Place::with_fleet();
+    place.write("node.toml", "[node]\nname = 'arm-1'\nrouters = ['quic://127.0.0.1:1']\nstate = 'state'\n");
+    let run = |args: &[&str], variables: &[(&str, &str)]| {
+        let mut command = place.command(args);
+        String::from_utf8(command.envs(variables.iter().copied()).output().unwrap().stdout).unwrap()
+    };
+    let check = ["check", "-c", "node.toml"];
+    let why = ["why", "/chatter", "-c", "node.toml"];
+    let forced = [("CLICOLOR_FORCE", "1")];
+    assert!(run(&check, &forced).starts_with(&format!("node.toml: {GREEN}no mistakes{RESET}\n")));
+    assert!(run(&why, &forced).starts_with(&format!("{RED}✗{RESET} no node runs")));
+    let json = |args: &[&str]| run(&[args, &["--json"]].concat(), &forced);
+    for plain in [
+        run(&check, &[]),
+        run(&why, &[("TERM", "xterm")]),
+        run(&check, &[forced[0], ("NO_COLOR", "1")]),
+        json(&check),
+        json(&why),
+    ] {
+        assert!(!plain.is_empty() && !plain.contains('\x1b'), "{plain}");
+    }
+    // With a terminal, which `script` makes.
+    let at_terminal = |variables: &[(&str, &str)]| {
+        let line = format!("{} check -c node.toml", env!("CARGO_BIN_EXE_sgc"));
+        let mut command = Command::new("script");
+        command.args(["--quiet", "--return", "--command", &line, "/dev/null"]).current_dir(place.path());
+        command.env_clear().env("PATH", std::env::var_os("PATH").unwrap()).stdin(Stdio::null());
+        String::from_utf8(command.envs(variables.iter().copied()).output().unwrap().stdout).unwrap()
+    };
+    assert!(at_terminal(&[("TERM", "xterm")]).contains(GREEN));
+    for variables in [
+        &[("TERM", "dumb")][..],
+        &[("TERM", "xterm"), ("NO_COLOR", "1")],
+        &[("TERM", "xterm"), ("CLICOLOR", "0")],
+    ] {
+        let plain = at_terminal(variables);
+        assert!(plain.contains("no mistakes") && !plain.contains(GREEN), "{variables:?}: {plain}");
+    }
+}

@@ -106,6 +106,39 @@ fn a_router_says_where_it_listens_and_how_it_is() {
 }
 
 #[test]
+fn states_are_coloured_on_request_and_columns_stay_aligned() {
+    let router = Router::start_with(|command, _| {
+        command.args(["--peer", "quic://127.0.0.1:1"]);
+    });
+    let status = |variables: &[(&str, &str)], args: &[&str]| {
+        let mut command = sgc(router.place.path(), &[&["status"], args].concat());
+        String::from_utf8(command.envs(variables.iter().copied()).output().unwrap().stdout).unwrap()
+    };
+    let deadline = Instant::now() + PATIENCE;
+    let red = "\x1b[31mtrying again in ";
+    let mut coloured = String::new();
+    while !coloured.contains(red) {
+        assert!(Instant::now() < deadline, "{coloured}");
+        std::thread::sleep(Duration::from_millis(20));
+        coloured = status(&[("CLICOLOR_FORCE", "1")], &[]);
+    }
+    let plain = coloured.replace("\x1b[31m", "").replace("\x1b[0m", "");
+    assert!(!plain.contains('\x1b'), "{plain}");
+    let column = |line: &str, text: &str| {
+        let line = plain.lines().find(|found| found.trim_start().starts_with(line)).unwrap();
+        line.find(text).unwrap_or_else(|| panic!("no {text} in {line}"))
+    };
+    let row = "quic://127.0.0.1:1 ";
+    assert_eq!(column("router ", "state"), column(row, "trying again"));
+    assert_eq!(column("router ", "last failure"), column(row, "quic://127.0.0.1:1: "));
+    for text in [status(&[], &[]), status(&[("CLICOLOR_FORCE", "1")], &["--json"])] {
+        assert!(text.contains("trying again") && !text.contains('\x1b'), "{text}");
+    }
+    router.signal(Signal::TERM);
+    assert!(router.end().0.success());
+}
+
+#[test]
 fn either_signal_ends_a_node_cleanly() {
     for signal in [Signal::TERM, Signal::INT] {
         let router = Router::start();

@@ -78,13 +78,17 @@ fn scenarios() -> Vec<Scenario> {
     all
 }
 
+fn lines(step: &crate::Step) -> Vec<String> {
+    step.lines().iter().map(ToString::to_string).collect()
+}
+
 fn topic(title: &str, graph: &Graph) -> Scenario {
     asked(title, graph, "/a")
 }
 
 fn asked(title: &str, graph: &Graph, topic: &str) -> Scenario {
     let steps = diagnose::interface(graph, topic);
-    Scenario { title: title.to_owned(), lines: steps.iter().flat_map(|step| step.lines()).collect() }
+    Scenario { title: title.to_owned(), lines: steps.iter().flat_map(lines).collect() }
 }
 
 /// Returns faults and findings beside those of the tables that other tests have.
@@ -393,7 +397,7 @@ fn reasons() -> Vec<Scenario> {
 /// Keeps the last step.
 fn last(title: &str, graph: &Graph) -> Scenario {
     let steps = diagnose::interface(graph, "/a");
-    Scenario { title: title.to_owned(), lines: steps.last().map(|step| step.lines()).unwrap_or_default() }
+    Scenario { title: title.to_owned(), lines: steps.last().map(lines).unwrap_or_default() }
 }
 
 fn patterns() -> Vec<Scenario> {
@@ -464,5 +468,5 @@ fn names() -> Vec<Scenario> {
 
 fn name(title: &str, graph: &Graph) -> Scenario {
     let steps = diagnose::name(graph, NAME);
-    Scenario { title: title.to_owned(), lines: steps.iter().flat_map(|step| step.lines()).collect() }
+    Scenario { title: title.to_owned(), lines: steps.iter().flat_map(lines).collect() }
 }

@@ -12,6 +12,7 @@ use sgc_diagnosis::{DiagnosisError, diagnose};
 use sgc_node::admin::report::ReportMember;
 use sgc_node::graph::Graph;
 use sgc_node::roster_row;
+use sgc_process::style::Line;
 use sgc_process::{ProcessError, unix_now};
 use sgc_trust::NodeName;
 
@@ -133,9 +134,9 @@ fn show(args: &StatusArgs, look: &FleetStatus, before: Option<&FleetStatus>) -> 
         lines.extend(look.details(node));
     }
     if args.watch.is_some() {
-        lines.push(String::new());
+        lines.push(Line::default());
     }
-    lines.iter().try_for_each(|line| output::line(output::clean(line)))
+    lines.into_iter().try_for_each(|line| Ok(line.cleaned().print()?))
 }
 
 /// Returns the members in a fleet file.
