@@ -9,14 +9,14 @@ FEATURES := --features sgc/sros2
 # other tests, too; then those with programs of others are ignored. A name stands for the suites of all crates, so no suite of
 # `unit` may have one of these names: it would run twice.
 LABS := $(addprefix --test ,fidelity gateway peers ros2)
-INTEROP := $(addprefix --test ,browser dashboard gateway_soak looking mended ring ros_graph transports vendors)
+INTEROP := $(addprefix --test ,browser dashboard gateway_soak looking mended ring ros_graph soak transports vendors)
 CLIENTS := $(addprefix --test ,foxglove grpc rosbridge)
 
 # Release builds name their commit (`sgc --version`), as far as the environment or the repository knows it.
 COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \
 	SGC_COMMIT_DATE=$${SGC_COMMIT_DATE-$$(git log -1 --format=%cs 2>/dev/null)}
 
-.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
+.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--seconds 10 --json")'
@@ -34,6 +34,7 @@ help:
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS; SGC_RING_DIR keeps the logs)'
 	@echo '                 churn (200 random restarts; SGC_CHURN_SEED, SGC_CHURN_STEPS)'
 	@echo '                 stall (ten minutes of images to a stalled subscriber; SGC_STALL_SECONDS)'
+	@echo '                 soak (20 nodes for two hours; SGC_SOAK_SECONDS, SGC_SOAK_SEED; SGC_SOAK_DIR keeps logs and samples; root)'
 	@echo '                 gateway-soak (500 clients of the gateway, and 20000 short connections; SGC_SOAK_CLIENTS, SGC_SOAK_CONNECTS)'
 	@echo '                 bench-graph (200 nodes, 2000 endpoints; SGC_GRAPH_NODES, SGC_GRAPH_SHARED, SGC_GRAPH_SECONDS)'
 	@echo '                 transports (NATs, roaming and bad paths for each transport; minutes)'
@@ -201,6 +202,12 @@ stall: peers
 # Runs the fuzz targets for long and adds new inputs to fuzz/corpus. `unit` runs the targets over that folder.
 fuzz:
 	scripts/fuzz.sh $(ARGS)
+
+# Runs twenty nodes with two hundred topics for two hours while nodes are killed and routers change, and fails if memory, file
+# descriptors, threads, logs or metrics grow. SGC_SOAK_DIR keeps the logs and samples. Root. The suite runs a short one.
+soak: peers
+	SGC_SOAK_SEED=$${SGC_SOAK_SEED:-$$(date +%s)} SGC_SOAK_SECONDS=$${SGC_SOAK_SECONDS:-7200} \
+		$(CARGO) test -p sgc $(FEATURES) --locked --test soak $(ARGS) -- --nocapture
 
 # Measures the memory of the gateway with a client that does not read, with 500 clients, and after 20000 short connections, as
 # many as one every two minutes makes in four weeks. The suite runs a short one.

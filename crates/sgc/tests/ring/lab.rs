@@ -4,12 +4,12 @@
 use std::fs;
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use rustix::process::Signal;
 use serde_json::Value;
-use sgc_testkit::netsim::{self, Namespace, NetsimError};
+use sgc_testkit::netsim::{Namespace, NetsimError};
 use tempfile::TempDir;
 
 use crate::graph::{Edge, End, Fault, Graph, NODES, Node};
@@ -41,7 +41,7 @@ impl Lab {
             None => temporary.as_ref().unwrap().path().to_owned(),
         };
         fs::create_dir_all(&dir).unwrap();
-        remove_abandoned();
+        support::remove_abandoned(PREFIX);
         let mut lab = Self {
             dir: dir.canonicalize().unwrap(),
             peer_life: peer_life.as_secs().to_string(),
@@ -269,16 +269,4 @@ fn interface(edge: Edge) -> String {
 
 fn address(edge: Edge, end: End) -> String {
     format!("10.92.{}.{}", edge.0, if end == End::Dialling { 2 } else { 1 })
-}
-
-/// Namespaces of runs whose process is gone without having removed them: killed, or ended from the terminal.
-fn remove_abandoned() {
-    let Ok(list) = netsim::ip(&["netns", "list"]) else { return };
-    for line in list.lines() {
-        let name = line.split_whitespace().next().unwrap_or_default();
-        let pid = name.strip_prefix(PREFIX).and_then(|rest| rest.split('-').nth(1));
-        if pid.is_some_and(|pid| pid.parse::<u32>().is_ok() && !Path::new("/proc").join(pid).exists()) {
-            let _ = netsim::ip(&["netns", "delete", name]);
-        }
-    }
 }

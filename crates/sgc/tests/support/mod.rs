@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
-use sgc_testkit::netsim::{Namespace, NetsimError};
+use sgc_testkit::netsim::{self, Namespace, NetsimError};
 
 /// Longest wait for an event, far beyond what any takes.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
@@ -43,6 +43,19 @@ pub(crate) fn own_network(name: String) -> Option<Namespace> {
     let made = Namespace::create(name);
     let made = made.and_then(|own| own.ip(&["link", "set", "lo", "multicast", "on"]).map(|_| own));
     namespaces(made, "using this host's network")
+}
+
+/// Removes namespaces `PREFIX-PID-…` whose process is gone without having removed them: killed, or ended from the
+/// terminal.
+pub(crate) fn remove_abandoned(prefix: &str) {
+    let Ok(list) = netsim::ip(&["netns", "list"]) else { return };
+    for line in list.lines() {
+        let name = line.split_whitespace().next().unwrap_or_default();
+        let pid = name.strip_prefix(prefix).and_then(|rest| rest.split('-').nth(1));
+        if pid.is_some_and(|pid| pid.parse::<u32>().is_ok() && !Path::new("/proc").join(pid).exists()) {
+            let _ = netsim::ip(&["netns", "delete", name]);
+        }
+    }
 }
 
 /// Returns the path of a file of this repository.
