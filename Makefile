@@ -10,7 +10,7 @@ FEATURES := --features sgc/sros2
 # `unit` may have one of these names: it would run twice.
 LABS := $(addprefix --test ,fidelity gateway peers ros2)
 INTEROP := $(addprefix --test ,browser dashboard gateway_soak looking mended ring ros_graph soak transports vendors)
-CLIENTS := $(addprefix --test ,foxglove grpc rosbridge)
+CLIENTS := $(addprefix --test ,foxglove grpc otlp rosbridge)
 
 # Release builds name their commit (`sgc --version`), as far as the environment or the repository knows it.
 COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \

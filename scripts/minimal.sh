@@ -9,9 +9,10 @@ cargo=${CARGO:-cargo}
 declare -A crates=(
     [dtls]="dimpl"
     [grpc]="tonic prost h2"
+    [otlp]="sgc-otlp prost rustls-native-certs"
 )
 
-for feature in "" dtls foxglove grpc rosbridge; do
+for feature in "" dtls foxglove grpc otlp rosbridge; do
     echo "features: ${feature:-none}"
     $cargo clippy -p sgc --no-default-features --features "$feature" --locked "$@" -- -D warnings
     tree=$($cargo tree -p sgc -e normal --no-default-features --features "$feature" --locked --prefix none --format '{p}' "$@")

@@ -75,7 +75,7 @@ pub struct Config {
     pub transport: TransportConfig,
     /// Gateway for programs without ROS; `None` without `[gateway]`. With it, `ros` is set as well.
     pub gateway: Option<GatewayConfig>,
-    /// Server of metrics; `None` without `[metrics]`.
+    /// Server and pushes of metrics; `None` without `[metrics]`.
     pub metrics: Option<MetricsConfig>,
     /// Path of the status socket, if not the usual one.
     pub admin_socket: Option<PathBuf>,

@@ -209,6 +209,10 @@ pub(crate) struct TransportDraft {
 #[derive(Debug, Default)]
 pub(crate) struct MetricsDraft {
     pub(crate) listen: Option<WithOrigin<String>>,
+    pub(crate) otlp: Option<WithOrigin<String>>,
+    pub(crate) otlp_interval: Option<WithOrigin<String>>,
+    pub(crate) otlp_headers_file: Option<WithOrigin<PathBuf>>,
+    pub(crate) otlp_ca: Option<WithOrigin<PathBuf>>,
 }
 
 /// `[gateway]`.

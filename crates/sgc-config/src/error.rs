@@ -13,6 +13,7 @@ use sgc_trust::{CertificateNameError, TokenError};
 
 use crate::config::{PEER_RATE_MAX, PEER_RATE_MIN};
 use crate::gateway::{GatewayUrl, GatewayUrlError};
+use crate::metrics::OtlpUrlError;
 use crate::router_url::RouterUrlError;
 use crate::units::{duration_text, rate_text, size_text};
 
@@ -520,6 +521,57 @@ pub enum Mistake {
         key: &'static str,
         /// The value.
         value: String,
+    },
+    /// The URL of a collector is invalid.
+    #[error("`{key}` is {value:?}: {fault}")]
+    OtlpUrl {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The fault.
+        fault: OtlpUrlError,
+    },
+    /// The URL of a collector has a user or a password. They are not repeated, since logs have mistakes.
+    #[error(
+        "`{key}` has a user or a password before its host, which logs would show: put them into `otlp_headers_file`"
+    )]
+    OtlpCredentials {
+        /// The key.
+        key: &'static str,
+    },
+    /// Pushes of metrics in a build without them.
+    #[error(
+        "`{key}` is given, and this sgc is built without pushes of metrics: build it with `cargo build --release -p sgc \
+         --features otlp`, or leave it out"
+    )]
+    OtlpNotBuilt {
+        /// The key.
+        key: &'static str,
+    },
+    /// A setting of pushes without a collector.
+    #[error(
+        "`{key}` is for pushes of metrics, and `otlp` does not say where they go: add it, or take `{key}` out"
+    )]
+    OtlpMissing {
+        /// The key.
+        key: &'static str,
+    },
+    /// CAs for a connection without TLS.
+    #[error("`{key}` is for https://, and `otlp` begins with http://: correct one of them")]
+    OtlpCaUnused {
+        /// The key.
+        key: &'static str,
+    },
+    /// A file with headers is invalid.
+    #[error("`{key}` names {}: {reason}", path.display())]
+    OtlpHeaders {
+        /// The key.
+        key: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The fault, with the line.
+        reason: String,
     },
     /// A listen address that is a search for routers.
     #[error(

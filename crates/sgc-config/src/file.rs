@@ -164,9 +164,7 @@ impl FileReader<'_> {
                 .map(|partner| self.partner(partner))
                 .collect(),
             gateway: gateway.map(|gateway| self.gateway(&gateway)),
-            metrics: metrics.map(|metrics| MetricsDraft {
-                listen: self.string(Some(&metrics), "listen", "a string, such as \"127.0.0.1:9464\""),
-            }),
+            metrics: metrics.map(|metrics| self.metrics(&metrics)),
         };
         draft.attempted = std::mem::take(&mut self.attempted);
         draft
@@ -350,6 +348,20 @@ impl FileReader<'_> {
                 .string(partner, "ca", "a string, such as \"acme-ca.pem\"")
                 .map(|ca| ca.map(PathBuf::from)),
             node,
+        }
+    }
+
+    fn metrics(&mut self, metrics: &Section<'_, '_>) -> MetricsDraft {
+        let metrics = Some(metrics);
+        let mut file = |key, expected| Some(self.string(metrics, key, expected)?.map(PathBuf::from));
+        let headers = file("otlp_headers_file", "a string, such as \"collector.headers\"");
+        let ca = file("otlp_ca", "a string, such as \"collector-ca.pem\"");
+        MetricsDraft {
+            listen: self.string(metrics, "listen", "a string, such as \"127.0.0.1:9464\""),
+            otlp: self.string(metrics, "otlp", "a string, such as \"http://collector.example:4318\""),
+            otlp_interval: self.string(metrics, "otlp_interval", "a string, such as \"60s\""),
+            otlp_headers_file: headers,
+            otlp_ca: ca,
         }
     }
 

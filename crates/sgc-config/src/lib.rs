@@ -36,7 +36,7 @@ pub use gateway::{
     GATEWAY_CLIENTS_MAX, GATEWAY_NAMES_MAX, GatewayClientConfig, GatewayConfig, GatewayScheme, GatewayTls,
     GatewayUrl, GatewayUrlError, ORIGINS_MAX,
 };
-pub use metrics::MetricsConfig;
+pub use metrics::{MetricsConfig, OtlpConfig, OtlpUrl, OtlpUrlError};
 pub use names::{FRAME_PREFIX_BYTES_MAX, PEER_BYTES_MAX, TYPE_BYTES_MAX};
 pub use recipient::Recipient;
 pub use resolve::{

@@ -15,6 +15,7 @@ use sgc_wire::NodeId;
 use crate::config::{PEER_RATE_MAX, PEER_RATE_MIN};
 use crate::error::{Mistake, TopicRule};
 use crate::gateway::GatewayUrl;
+use crate::metrics::{OtlpUrl, OtlpUrlError};
 use crate::recipient::Recipient;
 use crate::router_url::{RouterUrl, RouterUrlError};
 use crate::units::{parse_duration, parse_rate, parse_size};
@@ -343,6 +344,17 @@ pub(crate) fn resolver(key: &'static str, value: &str) -> Result<SocketAddr, Mis
 /// Checks the listening address of metrics, `ADDRESS:PORT`.
 pub(crate) fn metrics_listen(key: &'static str, value: &str) -> Result<SocketAddr, Mistake> {
     value.parse().map_err(|_| Mistake::MetricsListen { key, value: value.to_owned() })
+}
+
+/// Parses the URL of a collector of metrics.
+pub(crate) fn otlp(key: &'static str, value: &str) -> Result<OtlpUrl, Mistake> {
+    if cfg!(not(feature = "otlp")) {
+        return Err(Mistake::OtlpNotBuilt { key });
+    }
+    value.parse().map_err(|fault| match fault {
+        OtlpUrlError::Credentials => Mistake::OtlpCredentials { key },
+        fault => Mistake::OtlpUrl { key, value: value.to_owned(), fault },
+    })
 }
 
 /// Checks a listen address, `SCHEME://ADDRESS[:PORT]`.

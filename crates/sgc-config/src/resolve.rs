@@ -25,7 +25,7 @@ use crate::draft::{
     WithOrigin, Words,
 };
 use crate::error::{ConfigError, Mistake, Origin};
-use crate::metrics::MetricsConfig;
+use crate::metrics::{MetricsConfig, OtlpConfig};
 use crate::names;
 use crate::recipient::Recipient;
 use crate::ros_env::{self, Environment};
@@ -99,6 +99,10 @@ pub struct FileChecks {
     pub chain: fn(&'static str, &Path) -> Result<(), Mistake>,
     /// Checks the private key of the gateway.
     pub private_key: fn(&'static str, &Path) -> Result<(), Mistake>,
+    /// Checks the CAs of a collector of metrics.
+    pub roots: fn(&'static str, &Path) -> Result<(), Mistake>,
+    /// Checks a file with headers for a collector of metrics.
+    pub headers: fn(&'static str, &Path) -> Result<(), Mistake>,
     /// Checks a directory of message definitions.
     pub directory: fn(&'static str, &Path) -> Result<(), Mistake>,
 }
@@ -630,7 +634,47 @@ impl Resolver<'_> {
 
     fn metrics(&mut self, written: &MetricsDraft) -> MetricsConfig {
         let listen = written.listen.as_ref().and_then(|listen| self.keep(listen, names::metrics_listen));
-        listen.map(|listen| MetricsConfig { listen }).unwrap_or_default()
+        let default = MetricsConfig::default();
+        MetricsConfig { listen: listen.unwrap_or(default.listen), otlp: self.otlp(written) }
+    }
+
+    fn otlp(&mut self, written: &MetricsDraft) -> Option<OtlpConfig> {
+        let Some(otlp) = &written.otlp else {
+            let files = [&written.otlp_headers_file, &written.otlp_ca];
+            let interval = written.otlp_interval.iter().map(|written| (written.key, &written.origin));
+            let files = files.into_iter().flatten().map(|written| (written.key, &written.origin));
+            for (key, origin) in interval.chain(files) {
+                self.record(origin, Mistake::OtlpMissing { key });
+            }
+            return None;
+        };
+        let url = self.keep(otlp, names::otlp);
+        let bounds = (OtlpConfig::INTERVAL_MIN, OtlpConfig::INTERVAL_MAX);
+        let interval = written
+            .otlp_interval
+            .as_ref()
+            .and_then(|interval| self.keep(interval, |key, value| names::duration(key, value, bounds)));
+        let headers_file = self.otlp_file(written.otlp_headers_file.as_ref(), |checks| checks.headers);
+        let ca = self.otlp_file(written.otlp_ca.as_ref(), |checks| checks.roots);
+        if let (Some(url), Some(ca)) = (&url, &written.otlp_ca)
+            && !url.is_encrypted()
+        {
+            self.record(&ca.origin, Mistake::OtlpCaUnused { key: ca.key });
+        }
+        Some(OtlpConfig { url: url?, interval: interval.unwrap_or(OtlpConfig::INTERVAL), headers_file, ca })
+    }
+
+    fn otlp_file(
+        &mut self,
+        written: Option<&WithOrigin<PathBuf>>,
+        check: fn(&FileChecks) -> fn(&'static str, &Path) -> Result<(), Mistake>,
+    ) -> Option<PathBuf> {
+        let written = written?;
+        let path = self.path(written, "\"collector.headers\"")?;
+        if let Some(Err(mistake)) = self.checks.map(|checks| check(checks)(written.key, &path)) {
+            self.record(&written.origin, mistake);
+        }
+        Some(path)
     }
 
     fn audit(&mut self, draft: &Draft) -> AuditConfig {

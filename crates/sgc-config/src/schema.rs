@@ -178,7 +178,7 @@ impl Table {
             Self::Authority => &["fleet", "operators"],
             Self::Rotation => &["every", "messages"],
             Self::Audit => &["file", "max_bytes", "files", "off"],
-            Self::Metrics => &["listen"],
+            Self::Metrics => &["listen", "otlp", "otlp_interval", "otlp_headers_file", "otlp_ca"],
             Self::Partner => &["name", "ca", "node"],
             Self::Gateway => &[
                 "listen",

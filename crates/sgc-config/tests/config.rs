@@ -7,6 +7,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+#[cfg(feature = "otlp")]
+use sgc_config::OtlpConfig;
 use sgc_config::{
     ArgsConfig, AuditConfig, AuditRoom, Config, ConfigErrors, DiscoveryRange, GATEWAY_NAMES_MAX,
     GatewayConfig, Naming, Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, SecurityConfig, Shaping,
@@ -1411,6 +1413,63 @@ fn metrics_are_served_on_loopback_unless_told_otherwise() {
             "{said:?}"
         );
     }
+}
+
+#[test]
+#[cfg(feature = "otlp")]
+fn metrics_are_pushed_to_a_collector_by_its_url() {
+    let of = |text: &str| good(&format!("{NODE}[metrics]\n{text}")).metrics.unwrap().otlp;
+    assert_eq!(of(""), None);
+    let usual = of("otlp = 'http://collector.example:4318'").unwrap();
+    assert_eq!(usual, OtlpConfig::new("http://collector.example:4318/".parse().unwrap()));
+    assert_eq!(usual.interval, Duration::from_secs(60));
+    let own = of(
+        "otlp = 'https://a.example'\notlp_interval = '15s'\notlp_headers_file = 'a.headers'\notlp_ca = 'ca.pem'",
+    );
+    let own = own.unwrap();
+    assert_eq!((own.url.to_string().as_str(), own.interval.as_secs()), ("https://a.example/v1/metrics", 15));
+    assert_eq!(own.headers_file.as_deref(), Some(Path::new("/etc/sgc/a.headers")));
+    assert_eq!(own.ca.as_deref(), Some(Path::new("/etc/sgc/ca.pem")));
+    check_all(&[
+        (
+            "[metrics]\notlp = 'collector.example:4318'",
+            &["node.toml:4: `otlp` is \"collector.example:4318\": it takes the URL of a collector, such as \
+               \"http://collector.example:4318\""],
+        ),
+        (
+            "[metrics]\notlp = 'http://a:4317'",
+            &[
+                "node.toml:4: `otlp` is \"http://a:4317\": 4317 is the port of OTLP over gRPC, and this is OTLP over HTTP: \
+               collectors usually have it at port 4318",
+            ],
+        ),
+        (
+            "[metrics]\notlp = 'https://me:secret@a'",
+            &[
+                "node.toml:4: `otlp` has a user or a password before its host, which logs would show: put them into \
+               `otlp_headers_file`",
+            ],
+        ),
+        (
+            "[metrics]\notlp = 'http://a'\notlp_interval = '0s'",
+            &[
+                "node.toml:5: `otlp_interval` is \"0s\"; it takes a number with s, min, h or d, from \"1s\" to \"1d\"",
+            ],
+        ),
+        (
+            "[metrics]\notlp = 'http://a'\notlp_ca = 'ca.pem'",
+            &["node.toml:5: `otlp_ca` is for https://, and `otlp` begins with http://: correct one of them"],
+        ),
+        (
+            "[metrics]\notlp_interval = '15s'\notlp_headers_file = 'a'",
+            &[
+                "node.toml:4: `otlp_interval` is for pushes of metrics, and `otlp` does not say where they go: add it, or \
+                 take `otlp_interval` out",
+                "node.toml:5: `otlp_headers_file` is for pushes of metrics, and `otlp` does not say where they go: add it, or \
+                 take `otlp_headers_file` out",
+            ],
+        ),
+    ]);
 }
 
 #[test]

@@ -132,6 +132,10 @@ pub fn summary(
     }
     if let Some(metrics) = &config.metrics {
         rows.push(vec!["metrics".to_owned(), format!("http://{}/metrics", metrics.listen)]);
+        rows.extend(metrics.otlp.iter().map(|otlp| {
+            let every = otlp.interval.as_secs();
+            vec!["metrics".to_owned(), format!("pushed to {} every {every} s", otlp.url)]
+        }));
         rows.extend(metrics.warnings().into_iter().map(|warning| vec![WARNING.to_owned(), warning]));
     }
     rows.extend(

@@ -41,6 +41,17 @@ pub struct Status {
     router: RouterSize,
     gateway: Option<Gateway>,
     metrics: Option<String>,
+    otlp: Option<Pushes>,
+}
+
+/// Pushes of metrics of a node. Its alerts have the present fault.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct Pushes {
+    to: String,
+    accepted: u64,
+    failed: BTreeMap<String, u64>,
+    accepted_ago_s: Option<u64>,
 }
 
 /// A node's answer that reports an error.
@@ -263,11 +274,21 @@ impl Status {
             );
         }
         lines.extend(self.metrics.iter().map(|url| format!("Metrics: {url}").into()));
+        lines.extend(self.otlp.iter().map(|pushes| pushes.line().into()));
         let (nodes, names) = (output::several(nodes as u64, "node"), output::several(names, "name"));
         let known =
             format!("Router: {nodes} and {names} known, {routed_names} with a route; branches: {branches}");
         lines.push(known.into());
         lines
+    }
+}
+
+impl Pushes {
+    fn line(&self) -> String {
+        let Self { to, accepted, failed, accepted_ago_s } = self;
+        let last = accepted_ago_s.map(|ago_s| format!(", the last {ago_s} s ago")).unwrap_or_default();
+        let failed: u64 = failed.values().sum();
+        format!("Metrics pushed to {to}: {accepted} taken{last}; {failed} failed")
     }
 }
 

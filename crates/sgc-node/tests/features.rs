@@ -56,6 +56,13 @@ fn gateway_without_addresses_is_refused_if_every_protocol_is_missing() {
 }
 
 #[test]
+fn collectors_of_metrics_are_refused_without_pushes() {
+    check("metrics.otlp = 'http://a:4318'", "otlp", cfg!(feature = "otlp"), |mistake| {
+        matches!(mistake, Mistake::OtlpNotBuilt { key: "otlp" })
+    });
+}
+
+#[test]
 fn dtls_addresses_are_refused_without_dtls() {
     let is_absent =
         |mistake: &Mistake| matches!(mistake, Mistake::Url { fault: UrlError::NotBuilt { .. }, .. });

@@ -65,7 +65,7 @@ fn served_at(node: &Node) -> SocketAddr {
 }
 
 fn anywhere() -> Option<MetricsConfig> {
-    Some(MetricsConfig { listen: ([127, 0, 0, 1], 0).into() })
+    Some(MetricsConfig { listen: ([127, 0, 0, 1], 0).into(), ..MetricsConfig::default() })
 }
 
 #[test]
@@ -167,7 +167,8 @@ fn metrics_are_served_once_a_taken_port_is_free() {
     let trio = Trio::new();
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let listen = taken.local_addr().unwrap();
-    let cloud = trio.cloud_with(|config| config.metrics = Some(MetricsConfig { listen }));
+    let cloud =
+        trio.cloud_with(|config| config.metrics = Some(MetricsConfig { listen, ..MetricsConfig::default() }));
     let alert = || cloud.status()["alerts"][0].clone();
     wait("an alert", || alert()["kind"] == "metrics_not_served");
     assert_eq!(alert()["at"], listen.to_string());

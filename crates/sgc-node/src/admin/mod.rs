@@ -522,8 +522,9 @@ async fn status(desk: &Desk) -> Option<String> {
     let mut status = status.await.ok()?;
     status.gateway = desk.gateway.status();
     status.metrics = desk.metrics.url();
+    status.otlp = desk.metrics.push_status();
     status.alerts.extend(desk.gateway.alerts());
-    status.alerts.extend(desk.metrics.alert());
+    status.alerts.extend(desk.metrics.alerts());
     serde_json::to_string(&status).ok()
 }
 

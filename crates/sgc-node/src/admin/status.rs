@@ -12,6 +12,7 @@ use super::route_words::route_state;
 use crate::control::faults::alerts::Alert;
 use crate::data::stats::NameStats;
 use crate::discovery::board::RouterStatus;
+use crate::metrics::push::PushStatus;
 
 /// The status document.
 #[derive(Clone, Debug, Serialize)]
@@ -47,6 +48,8 @@ pub struct Status {
     pub gateway: Option<GatewayStatus>,
     /// The URL at which metrics are served; null if they are not.
     pub metrics: Option<String>,
+    /// Pushes of metrics to an OpenTelemetry collector; null if there are none.
+    pub otlp: Option<PushStatus>,
 }
 
 /// A link that is up.

@@ -12,10 +12,11 @@ use sgc_config::{FileChecks, IdentityFile, Mistake};
 use sgc_trust::{ShareToken, TOKEN_TEXT_BYTES_MAX};
 
 use crate::control::fleet::partners;
+use crate::metrics::headers;
 use crate::state;
 
 /// Largest file of certificates or of a key for TLS, bytes.
-const PEM_BYTES_MAX: u64 = 256 * 1024;
+pub(crate) const PEM_BYTES_MAX: u64 = 256 * 1024;
 
 /// The checks of [`super::load`].
 pub(super) const FILES: FileChecks = FileChecks {
@@ -25,6 +26,8 @@ pub(super) const FILES: FileChecks = FileChecks {
     fleet: check_fleet,
     chain: check_chain,
     private_key: check_private_key,
+    roots: check_roots,
+    headers: check_headers,
     directory: check_directory,
 };
 
@@ -62,6 +65,23 @@ fn check_fleet(key: &'static str, path: &Path) -> Result<(), Mistake> {
 }
 
 fn check_chain(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    check_certificates(key, path, "a file of certificates in PEM, the server's own first")
+}
+
+fn check_roots(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    check_certificates(key, path, "a file of CA certificates in PEM")
+}
+
+fn check_headers(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    private(key, path, "the collector's token")?;
+    let reason = match headers::read(path) {
+        Ok(_) => return Ok(()),
+        Err(error) => error.to_string(),
+    };
+    Err(Mistake::OtlpHeaders { key, path: path.to_owned(), reason })
+}
+
+fn check_certificates(key: &'static str, path: &Path, expected: &'static str) -> Result<(), Mistake> {
     let read = fs::File::open(path).and_then(|file| {
         let mut pem = Vec::new();
         file.take(PEM_BYTES_MAX).read_to_end(&mut pem).map(|_| pem)
@@ -72,7 +92,6 @@ fn check_chain(key: &'static str, path: &Path) -> Result<(), Mistake> {
         Ok(Err(error)) => error.to_string(),
         Err(error) => error.to_string(),
     };
-    let expected = "a file of certificates in PEM, the server's own first";
     Err(Mistake::File { key, path: path.to_owned(), reason, expected })
 }
 

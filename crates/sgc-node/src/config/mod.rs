@@ -2,7 +2,7 @@
 //!
 //! `sgc-config` turns their text into a [`Config`]. The node checks the content of the identity file when it opens it.
 
-mod files;
+pub(crate) mod files;
 
 use std::fs;
 use std::io::{self, Read};

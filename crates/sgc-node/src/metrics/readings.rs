@@ -10,6 +10,7 @@ use sgc_wire::UnixMillis;
 use crate::admin::status::RouterLine;
 use crate::control::faults::alerts::Alert;
 use crate::discovery::RouterStatus;
+use crate::metrics::push::PushStatus;
 
 /// Most shares and uses that metrics show one by one. A pattern may bring any number of topics.
 pub(crate) const ROUTES_MAX: usize = 1000;
@@ -43,6 +44,8 @@ pub(crate) struct Readings {
     pub(crate) router: RouterLine,
     /// The gateway, if there is one.
     pub(crate) gateway: Option<GatewayStatus>,
+    /// Pushes of metrics, if there are some.
+    pub(crate) pushes: Option<PushStatus>,
 }
 
 /// The links of a node.

@@ -7,7 +7,6 @@
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use prometheus_client::collector::Collector;
@@ -27,9 +26,9 @@ use crate::discovery::board::LINKED;
 use crate::drops::NodeDrop;
 
 /// The label that all series have.
-const NODE: &str = "node";
+pub(super) const NODE: &str = "node";
 /// The end of the names of counters.
-const COUNTER_SUFFIX: &str = "_total";
+pub(super) const COUNTER_SUFFIX: &str = "_total";
 /// The labels of a share or use.
 const ROUTE: &[&str] = &["direction", "interface", "owner"];
 /// The origin of routers that were found on the local network, in the status.
@@ -65,17 +64,30 @@ impl fmt::Debug for Metric {
     }
 }
 
+impl Metric {
+    /// Returns the values of the metric.
+    pub(super) fn series(&self, sample: &Sample) -> Series {
+        (self.read)(sample)
+    }
+}
+
 /// A node and its process at one moment.
 #[derive(Clone, Debug)]
 pub(super) struct Sample {
-    pub(super) readings: Arc<Readings>,
+    pub(super) readings: Readings,
     pub(super) process: Process,
     /// The start of the node.
     pub(super) started: SystemTime,
+    /// The moment.
+    #[cfg_attr(
+        not(feature = "otlp"),
+        expect(dead_code, reason = "only pushes say when their values were read")
+    )]
+    pub(super) at: SystemTime,
 }
 
 /// The values of a metric by their labels' values. Prometheus refuses two values with the same labels.
-type Series = BTreeMap<Vec<String>, f64>;
+pub(super) type Series = BTreeMap<Vec<String>, f64>;
 
 fn unlabelled(value: impl Into<Option<f64>>) -> Series {
     value.into().map(|value| (Vec::new(), value)).into_iter().collect()
@@ -274,6 +286,18 @@ pub const METRICS: &[Metric] = &[
             by_label(refused.map(|(reason, n)| (reason, as_f64(*n))))
         },
     ),
+    counter(
+        "sgc_otlp_pushes_total",
+        &["result"],
+        "Pushes of metrics to a collector: `accepted`, or [why not](../how-to/monitoring.md#if-the-collector-takes-nothing).",
+        |s| {
+            let pushes = s.readings.pushes.iter();
+            by_label(pushes.flat_map(|pushes| {
+                let failed = pushes.failed.iter().map(|(reason, n)| (*reason, as_f64(*n)));
+                failed.chain([("accepted", as_f64(pushes.accepted))])
+            }))
+        },
+    ),
     counter("process_cpu_seconds_total", &[], "Time of the process on processors, in seconds.", |s| {
         unlabelled(s.process.cpu.as_secs_f64())
     }),
@@ -298,7 +322,7 @@ pub const METRICS: &[Metric] = &[
 impl Collector for Sample {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
         for metric in METRICS {
-            let series = (metric.read)(self);
+            let series = metric.series(self);
             if series.is_empty() {
                 continue;
             }
@@ -328,7 +352,7 @@ fn encode(encoder: MetricEncoder<'_>, kind: MetricKind, value: f64) -> fmt::Resu
 }
 
 /// Returns the help without quotation marks and links of Markdown.
-fn without_markup(help: &str) -> String {
+pub(super) fn without_markup(help: &str) -> String {
     let (mut plain, mut rest) = (String::new(), help);
     while let Some((before, (shown, after))) =
         rest.split_once('[').and_then(|(before, link)| Some((before, link.split_once("](")?)))
@@ -352,4 +376,45 @@ pub(super) fn text(sample: Sample) -> Result<String, fmt::Error> {
     let mut text = String::new();
     prometheus_text::encode(&mut text, &registry)?;
     Ok(text)
+}
+
+/// Returns a sample with some values of most metrics.
+#[cfg(all(test, feature = "otlp"))]
+pub(super) fn sample() -> Sample {
+    use crate::metrics::push::PushStatus;
+    use crate::metrics::readings::RouteReading;
+
+    let route = RouteReading {
+        direction: "share",
+        topic: "/topic \"x\"".to_owned(),
+        owner: "robot".to_owned(),
+        is_ready: true,
+        messages: 7,
+    };
+    let pushes = PushStatus {
+        to: "http://127.0.0.1:4318/v1/metrics".to_owned(),
+        accepted: 5,
+        failed: BTreeMap::from([("busy", 2)]),
+        accepted_ago_s: None,
+        fault: None,
+    };
+    let readings = Readings {
+        node: "robot".to_owned(),
+        uptime: Duration::from_millis(1500),
+        certificate_until: sgc_wire::UnixMillis(1_900_000_000_123),
+        links: LinkReadings { dialled: 2, sent_bytes: 1 << 40, ..LinkReadings::default() },
+        routers: Vec::new(),
+        routes: vec![route],
+        routes_omitted: 0,
+        alerts: vec![Alert::LocalNetworkAlone],
+        problems: 1,
+        drops: BTreeMap::from([("sink_lost".to_owned(), 3)]),
+        refused: BTreeMap::new(),
+        reopened: 0,
+        router: crate::admin::status::RouterLine { nodes: 1, names: 2, routed_names: 2, branches: 0 },
+        gateway: None,
+        pushes: Some(pushes),
+    };
+    let started = UNIX_EPOCH + Duration::from_secs(1_800_000_000);
+    Sample { readings, process: Process::read(), started, at: started + Duration::from_millis(1500) }
 }

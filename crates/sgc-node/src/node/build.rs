@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
-use sgc_config::Config;
+use sgc_config::{Config, MetricsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_ros::{RosNetwork, Routes};
 use sgc_router::{Router, RouterConfig};
@@ -102,7 +102,7 @@ pub(super) async fn build<N: RosNetwork>(
 ) -> Result<BuiltNode<N>, NodeError> {
     let NodeParts { config, identity, network, open, state, run_lock } = parts;
     let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
-    let of_metrics = config.metrics.map(|metrics| metrics.warnings()).unwrap_or_default();
+    let of_metrics = config.metrics.as_ref().map(MetricsConfig::warnings).unwrap_or_default();
     let warnings = config.warnings();
     warnings.iter().chain(&of_metrics).chain(&rules.warnings).for_each(|warning| warn!("{warning}"));
     let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
@@ -117,7 +117,7 @@ pub(super) async fn build<N: RosNetwork>(
     let found = NodeDefinitions { files: definitions.clone(), described: types.clone() };
     let gateway = Gateway::new(open_gateway, identity.node_name().as_str(), found);
     listen_for_clients(&gateway, &config, &identity, &rules, state.as_deref(), &audit).await?;
-    let metrics = Arc::new(Metrics::new(config.metrics));
+    let metrics = Arc::new(Metrics::new(config.metrics.as_ref()));
     let (events, inbox) = mpsc::channel(INBOX_MAX);
     // Every thread and blocking task that uses this runtime holds a clone of `alive`, since the runtime must outlive
     // them.

@@ -30,6 +30,7 @@ use crate::node::error::NodeError;
 use crate::node::identity::wanted_nearby;
 use crate::node::local::join_late;
 use crate::node::options::{RunOptions, Watchdog, admin_socket_path};
+use crate::node::random::system_rng;
 use crate::state::audit::{Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::state::run_lock::RunLock;
 
@@ -109,7 +110,12 @@ pub(super) async fn spawn<N: RosNetwork>(
         events.clone(),
     )));
     let metrics = node.metrics;
-    tasks.push(tokio::spawn(metrics.clone().run(events.clone(), gateway.clone())));
+    tasks.push(tokio::spawn(metrics.clone().run(
+        events.clone(),
+        gateway.clone(),
+        identity.clone(),
+        system_rng()?,
+    )));
     let reloader = Arc::new(Reloader {
         source: options.source,
         join: node.open.map(|open| join_late(open, network.clone(), events.clone(), gateway.clone())),

@@ -38,8 +38,9 @@ fn page() -> String {
     let mut page = generated::note("the metrics that a node serves");
     page.push_str("# Metrics\n\n");
     for paragraph in [
-        "A node with [`[metrics]`](configuration.md#metrics) serves these metrics for Prometheus. [How to watch nodes with \
-         Prometheus](../how-to/monitoring.md) has the first steps.",
+        "A node with [`[metrics]`](configuration.md#metrics) serves these metrics for Prometheus, and pushes them to an \
+         OpenTelemetry collector if `otlp` names one. [How to watch nodes with Prometheus](../how-to/monitoring.md) has the \
+         first steps.",
         "All metrics have the label `node`, with the name of the node. A metric without values is left out, such as those of \
          a gateway that is not there. The number of series is bounded: there is none for each 256-bit name, peer or client, \
          and at most 1000 shares and uses have some.",

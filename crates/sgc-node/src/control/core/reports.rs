@@ -120,7 +120,7 @@ impl<N: RosNetwork> Core<N> {
     fn node_report(&self) -> NodeReport {
         let identity = self.certificates.identity();
         let mut alerts = self.alerts();
-        alerts.extend(self.gateway.alerts().into_iter().chain(self.metrics.alert()));
+        alerts.extend(self.gateway.alerts().into_iter().chain(self.metrics.alerts()));
         alerts.truncate(REPORT_FAULTS_MAX);
         let mut problems = self.problems();
         problems.truncate(REPORT_FAULTS_MAX);

@@ -34,10 +34,11 @@ impl<N: RosNetwork> Core<N> {
             // The caller adds them, since the core knows nothing of the gateway and of metrics.
             gateway: None,
             metrics: None,
+            otlp: None,
         }
     }
 
-    /// Returns the values of metrics. The caller adds those of the gateway.
+    /// Returns the values of metrics. The caller adds those of the gateway and of pushes.
     pub(super) fn readings(&self) -> Readings {
         let router = self.router_line();
         let routes = self.routes.iter().flat_map(Routes::status);
@@ -59,6 +60,7 @@ impl<N: RosNetwork> Core<N> {
             reopened: self.reopening.reopenings(),
             router,
             gateway: None,
+            pushes: None,
         }
     }
 

@@ -128,6 +128,13 @@ pub enum Alert {
         /// The reason.
         reason: String,
     },
+    /// The collector did not take the last push of metrics.
+    MetricsNotPushed {
+        /// The URL of the collector.
+        to: String,
+        /// The reason.
+        reason: String,
+    },
     /// DDS Security protects both this node and local programs, and one does not admit the other.
     RefusedPrograms {
         /// The enclave that they name, `/` if they have none of their own.
@@ -214,6 +221,10 @@ impl Alert {
                 "find the process that holds the port (`ss -ltnp`), or give this node another address: `listen` in [metrics]. Each node of \
                  a host needs a port of its own. The node tries again by itself"
             }
+            Self::MetricsNotPushed { .. } => {
+                "look whether a collector takes OTLP over HTTP there, and what its log says; `otlp` in [metrics] names it, \
+                 `otlp_headers_file` its token. The node pushes again by itself"
+            }
             Self::RefusedPrograms { .. } => {
                 "the log says who refuses whom where Cyclone DDS does; compare CA, governance and permissions of the two enclaves, and when \
                  both certificates end"
@@ -292,6 +303,9 @@ impl fmt::Display for Alert {
             }
             Self::MetricsNotServed { at, reason } => {
                 write!(f, "metrics are not served at {at}: {reason}")
+            }
+            Self::MetricsNotPushed { to, reason } => {
+                write!(f, "metrics are not pushed to {to}: {reason}")
             }
             Self::RefusedPrograms { enclave } => write!(
                 f,

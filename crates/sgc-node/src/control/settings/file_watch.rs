@@ -101,8 +101,10 @@ fn files_of(file: &Path, config: &Config) -> Vec<PathBuf> {
     let cas = config.partners.iter().map(|partner| &partner.ca).chain(&config.trust).chain(&config.accept);
     let shown = config.gateway.iter().filter_map(|gateway| gateway.tls.as_ref());
     let shown = shown.flat_map(|tls| [&tls.certificate, &tls.key]);
+    let otlp = config.metrics.iter().filter_map(|metrics| metrics.otlp.as_ref());
+    let otlp = otlp.flat_map(|otlp| otlp.headers_file.iter().chain(&otlp.ca));
     let own = std::iter::once(&config.identity);
-    let named: BTreeSet<PathBuf> = own.chain(tokens).chain(cas).chain(shown).cloned().collect();
+    let named: BTreeSet<PathBuf> = own.chain(tokens).chain(cas).chain(shown).chain(otlp).cloned().collect();
     std::iter::once(file.to_owned()).chain(named).collect()
 }
 
@@ -180,6 +182,18 @@ impl Bell {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    #[cfg(feature = "otlp")]
+    fn files_for_a_collector_are_watched_like_other_files() {
+        let text = "identity = 'x'\n[node]\nrouters = ['quic://r']\n[metrics]\notlp = 'https://a'\n\
+                    otlp_headers_file = 'a.headers'\notlp_ca = 'a.pem'\n";
+        let config = sgc_config::parse(text, "node.toml", Path::new("/etc/sgc"), &|_| None).unwrap();
+        let files = files_of(Path::new("/etc/sgc/node.toml"), &config);
+        let wanted =
+            ["/etc/sgc/node.toml", "/etc/sgc/a.headers", "/etc/sgc/a.pem", "/etc/sgc/x"].map(PathBuf::from);
+        assert_eq!(files, wanted);
+    }
 
     #[test]
     fn gateway_certificate_files_are_watched_like_other_files() {

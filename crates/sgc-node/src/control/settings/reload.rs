@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
-use sgc_config::{Config, ConfigErrors, GatewayConfig, RosConfig};
+use sgc_config::{Config, ConfigErrors, GatewayConfig, MetricsConfig, RosConfig};
 use sgc_gateway::Access;
 use sgc_ros::{Direction, ShareRule, UseRule};
 use sgc_transport::CredentialStore;
@@ -253,12 +253,9 @@ impl Reloader {
         report.changed.extend(searched.begun.iter().map(|url| format!("{url} is searched for")));
         report.changed.extend(searched.ended.iter().map(|url| format!("{url} is no longer searched for")));
         if running.config.metrics != config.metrics {
-            self.metrics.set(config.metrics);
-            report.warnings.extend(config.metrics.iter().flat_map(|metrics| metrics.warnings()));
-            report.changed.push(match config.metrics {
-                Some(metrics) => format!("metrics are to be served at http://{}/metrics", metrics.listen),
-                None => "metrics are not served any more".to_owned(),
-            });
+            self.metrics.set(config.metrics.as_ref());
+            report.warnings.extend(config.metrics.iter().flat_map(MetricsConfig::warnings));
+            report.changed.extend(metrics_changes(running.config.metrics.as_ref(), config.metrics.as_ref()));
         }
         self.audit.set_names(rules.names.clone());
         running.config = merged(running.config.clone(), config);
@@ -507,6 +504,28 @@ fn needs_other_buffers(before: Option<&GatewayConfig>, after: Option<&GatewayCon
 /// Returns the listening addresses of a gateway.
 fn addresses(gateway: &GatewayConfig) -> String {
     gateway.listen.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// Lists the differences of metrics.
+fn metrics_changes(before: Option<&MetricsConfig>, after: Option<&MetricsConfig>) -> Vec<String> {
+    let listen = |metrics: Option<&MetricsConfig>| metrics.map(|metrics| metrics.listen);
+    let otlp = |metrics: Option<&MetricsConfig>| metrics.and_then(|metrics| metrics.otlp.clone());
+    let mut lines = Vec::new();
+    if listen(before) != listen(after) {
+        lines.push(match listen(after) {
+            Some(listen) => format!("metrics are to be served at http://{listen}/metrics"),
+            None => "metrics are not served any more".to_owned(),
+        });
+    }
+    if otlp(before) != otlp(after) {
+        lines.push(match otlp(after) {
+            Some(otlp) => {
+                format!("metrics are to be pushed to {} every {} s", otlp.url, otlp.interval.as_secs())
+            }
+            None => "metrics are not pushed any more".to_owned(),
+        });
+    }
+    lines
 }
 
 /// Lists the differences, one line for each topic.
