@@ -82,6 +82,9 @@ pub struct IdentityFile<'i> {
     pub node_name: Option<&'i NodeName>,
 }
 
+/// A check of a named file, which takes the key that names it.
+type FileCheck = fn(&'static str, &Path) -> Result<(), Mistake>;
+
 /// Checks of named files. They are an argument, since they read the file system.
 ///
 /// Each takes the key that names the file, and its path.
@@ -654,8 +657,11 @@ impl Resolver<'_> {
             .otlp_interval
             .as_ref()
             .and_then(|interval| self.keep(interval, |key, value| names::duration(key, value, bounds)));
-        let headers_file = self.otlp_file(written.otlp_headers_file.as_ref(), |checks| checks.headers);
-        let ca = self.otlp_file(written.otlp_ca.as_ref(), |checks| checks.roots);
+        let (headers, roots) =
+            (self.checks.map(|checks| checks.headers), self.checks.map(|checks| checks.roots));
+        let headers_file =
+            self.otlp_file(written.otlp_headers_file.as_ref(), "\"collector.headers\"", headers);
+        let ca = self.otlp_file(written.otlp_ca.as_ref(), "\"collector-ca.pem\"", roots);
         if let (Some(url), Some(ca)) = (&url, &written.otlp_ca)
             && !url.is_encrypted()
         {
@@ -667,11 +673,12 @@ impl Resolver<'_> {
     fn otlp_file(
         &mut self,
         written: Option<&WithOrigin<PathBuf>>,
-        check: fn(&FileChecks) -> fn(&'static str, &Path) -> Result<(), Mistake>,
+        example: &'static str,
+        check: Option<FileCheck>,
     ) -> Option<PathBuf> {
         let written = written?;
-        let path = self.path(written, "\"collector.headers\"")?;
-        if let Some(Err(mistake)) = self.checks.map(|checks| check(checks)(written.key, &path)) {
+        let path = self.path(written, example)?;
+        if let Some(Err(mistake)) = check.map(|check| check(written.key, &path)) {
             self.record(&written.origin, mistake);
         }
         Some(path)
