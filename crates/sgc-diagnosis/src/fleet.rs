@@ -729,14 +729,14 @@ mod tests {
         let members = ["arm", "desk"].map(|name| member(name, name, false)).into();
         let named = ["arm".to_owned()];
         let mut fleet = FleetStatus::new(UnixMillis(NOW), members, vec![answer_of(arm)], &named);
-        let lines = fleet.details(&fleet.nodes[0]).join("\n");
+        let lines = plain(&fleet.details(&fleet.nodes[0])).join("\n");
         assert!(
             lines.contains("/odom   desk, stolen (no member has this name), ghost (no member"),
             "{lines}"
         );
         assert!(lines.contains("and 7 more"), "{lines}");
         fleet.members_omitted = 1;
-        let lines = fleet.details(&fleet.nodes[0]).join("\n");
+        let lines = plain(&fleet.details(&fleet.nodes[0])).join("\n");
         assert!(lines.contains("ghost (it is not among the members that are known here)"), "{lines}");
     }
 
