@@ -87,7 +87,9 @@ impl Recipients {
             }
             let is_meant = |name: &str, member: Option<&ReportMember>| match word.strip_prefix(GROUP) {
                 Some(group) => member.is_some_and(|member| member.groups.iter().any(|one| one == group)),
-                None => word == EVERYONE || word == name,
+                // Routers are meant only by name or group.
+                None if word == EVERYONE => member.is_none_or(|member| !member.router),
+                None => word == name,
             };
             let meant = here.iter().enumerate().filter(|(_, (name, member))| is_meant(name, *member));
             let members: Vec<_> = meant.map(|(at, _)| at).collect();
@@ -177,7 +179,7 @@ mod tests {
         let found = recipients(true, &["*", "group:arms", "group:operators", "desk", "guest", "desk"]);
         assert_eq!(found.members, ["arm", "cloud", "desk", "guest"]);
         for (word, names) in [
-            ("*", &["arm", "cloud", "desk", "guest"][..]),
+            ("*", &["arm", "desk", "guest"][..]),
             ("group:arms", &["arm", "cloud", "desk"]),
             ("group:operators", &["desk"]),
             ("desk", &["desk"]),

@@ -260,6 +260,20 @@ fn the_holder_of_an_invitation_is_refused_what_everyone_in_the_fleet_may_have() 
     }
 }
 
+/// It sees names, and holds no secret of the fleet.
+#[test]
+fn router_is_refused_what_everyone_in_the_fleet_may_have() {
+    let mut bench = owner();
+    let topic = bench.share_with_fleet("/a");
+    let router = identity(&Member { router: true, ..Member::new("cloud") });
+    let member = identity(&Member::new("desk"));
+    for (who, answer) in [(&router, Some(RefuseReason::NotPermitted)), (&member, None)] {
+        let (frame, _) = join(&bench, who, topic, 1);
+        bench.frame(frame);
+        assert_eq!(bench.answers(), [(SinkId([1; 16]), answer)]);
+    }
+}
+
 /// Holders displace each other, and take no place that members have.
 #[test]
 fn holders_of_invitations_have_places_of_their_own() {

@@ -9,7 +9,7 @@ use crate::{CaFingerprint, VerifiedPeer};
 /// A set of peers, by the facts that their certificates prove.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Grantees {
-    /// Every node of the fleets with these CAs.
+    /// Every node of the fleets with these CAs, except those whose certificates let them route.
     pub fleets: BTreeSet<CaFingerprint>,
     /// These nodes.
     pub nodes: BTreeSet<NodeId>,
@@ -31,21 +31,31 @@ pub enum GrantReason {
 impl Grantees {
     /// Returns the reason why `peer` is in the set, if it is. The holder of an invitation is in none, since it is no
     /// member yet.
+    ///
+    /// A node that may route is in the set only by its name or group: routers see names and must not get their keys,
+    /// and a certificate does not tell whether its node holds the fleet's secret as well.
     pub fn find(&self, peer: &VerifiedPeer) -> Option<GrantReason> {
         if peer.invitation.is_some() {
             return None;
         }
-        self.find_parts(&peer.node_id, &peer.ca, &peer.groups)
+        self.find_parts(&peer.node_id, &peer.ca, &peer.groups, peer.may_route)
     }
 
     /// Returns the reason why a node with these facts is in the set, if it is. For questions about an absent node;
     /// [`Grantees::find`] decides about a present one.
-    pub fn find_parts(&self, node: &NodeId, ca: &CaFingerprint, groups: &[GroupTag]) -> Option<GrantReason> {
+    pub fn find_parts(
+        &self,
+        node: &NodeId,
+        ca: &CaFingerprint,
+        groups: &[GroupTag],
+        may_route: bool,
+    ) -> Option<GrantReason> {
         if self.nodes.contains(node) {
             return Some(GrantReason::Node);
         }
         let group = groups.iter().find(|g| self.groups.contains(&(*ca, **g)));
-        group.map(|g| GrantReason::Group(*g)).or(self.fleets.contains(ca).then_some(GrantReason::Fleet))
+        let is_of_fleet = self.fleets.contains(ca) && !may_route;
+        group.map(|g| GrantReason::Group(*g)).or(is_of_fleet.then_some(GrantReason::Fleet))
     }
 
     /// Returns `true` if the set is empty.

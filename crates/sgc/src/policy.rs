@@ -175,7 +175,10 @@ fn subject(
         };
         let mut groups: Vec<_> = groups.iter().map(|group| secret.group_tag(group.as_str())).collect();
         groups.sort_unstable();
-        return Ok((name.to_string(), Ok(Subject { node, ca: identity.as_peer().ca, groups })));
+        return Ok((
+            name.to_string(),
+            Ok(Subject { node, ca: identity.as_peer().ca, groups, may_route: false }),
+        ));
     }
     let (who, chain) = match (&args.identity_file, &args.certificate) {
         (Some(path), _) => {

@@ -22,11 +22,13 @@ pub struct Subject {
     pub ca: CaFingerprint,
     /// Its groups, sorted.
     pub groups: Vec<GroupTag>,
+    /// Whether its certificate lets it route.
+    pub may_route: bool,
 }
 
 impl From<&VerifiedPeer> for Subject {
     fn from(peer: &VerifiedPeer) -> Self {
-        Self { node: peer.node_id, ca: peer.ca, groups: peer.groups.to_vec() }
+        Self { node: peer.node_id, ca: peer.ca, groups: peer.groups.to_vec(), may_route: peer.may_route }
     }
 }
 
@@ -145,7 +147,10 @@ pub fn explain(
     subject: &Subject,
     role: Role,
 ) -> Verdict {
-    let finds = |set: &Grantees| set.find_parts(&subject.node, &subject.ca, &subject.groups).is_some();
+    let finds = |set: &Grantees| {
+        let Subject { node, ca, groups, may_route } = subject;
+        set.find_parts(node, ca, groups, *may_route).is_some()
+    };
     if subject.node == identity.node_id() {
         return Verdict { permitted: true, because: "it is the owner".to_owned() };
     }
@@ -234,6 +239,9 @@ fn why_not(
     }
     let list: Vec<_> = entries.iter().map(|entry| format!("\"{entry}\"")).collect();
     let mut text = format!("`{key}` of {} names {}, and it is none of them", share.topic, list.join(", "));
+    if subject.may_route && subject.ca == identity.as_peer().ca {
+        text.push_str(": it may route, and \"*\" does not stand for such nodes, so name it or a group of it");
+    }
     let is_partner = partners.configured.iter().find(|(_, p)| p.cas.contains(&subject.ca));
     if subject.ca == identity.as_peer().ca {
         let groups = subject.groups.len();
