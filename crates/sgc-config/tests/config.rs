@@ -686,11 +686,12 @@ fn topics_say_how_much_of_them_goes_on() {
 fn transports_are_set_by_a_table_of_their_own() {
     let set = |text: &str| good(&format!("{NODE}[transport]\n{text}")).transport;
     assert_eq!((good(NODE).transport, set("")), (TransportConfig::default(), TransportConfig::default()));
-    let all = "congestion = 'cubic'\noffload = false\nmtu_discovery = false\ndtls_1_2 = true\ndscp = 'CS1'\nlane_dscp = 'AF41'";
+    let all = "congestion = 'cubic'\noffload = false\nmtu_discovery = false\nbulk_lanes = false\ndtls_1_2 = true\ndscp = 'CS1'\nlane_dscp = 'AF41'";
     let expected = TransportConfig {
         congestion: Congestion::Cubic,
         offload: false,
         mtu_discovery: false,
+        bulk_lanes: false,
         dtls12: true,
         dscp: Some(8),
         lane_dscp: Some(34),
