@@ -213,6 +213,8 @@ impl BulkLaneUse {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::disallowed_methods)]
+
     use super::*;
 
     const LOOK: Duration = Duration::from_millis(500);
