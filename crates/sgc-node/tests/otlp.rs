@@ -256,6 +256,10 @@ fn scrape(node: &Node) -> (BTreeMap<String, f64>, BTreeMap<String, String>) {
     (series, types)
 }
 
+fn value_of(point: &Value) -> f64 {
+    point["value"].as_str().unwrap().parse().unwrap()
+}
+
 /// Returns the values of a push by series, as Prometheus writes these.
 fn series_of(push: &Value) -> BTreeMap<String, f64> {
     let mut series = BTreeMap::new();
@@ -264,7 +268,7 @@ fn series_of(push: &Value) -> BTreeMap<String, f64> {
             let label = |label: &Value| format!("{}={}", label[0].as_str().unwrap(), label[1]);
             let labels: Vec<_> = point["labels"].as_array().unwrap().iter().map(label).collect();
             let name = format!("{}{{{}}}", metric["name"].as_str().unwrap(), labels.join(","));
-            assert!(series.insert(name, point["value"].as_f64().unwrap()).is_none());
+            assert!(series.insert(name, value_of(point)).is_none());
         }
     }
     series
@@ -305,7 +309,7 @@ fn independent_collector_sees_the_values_of_a_scrape_at_that_moment() {
     let metrics = push["metrics"].as_array().unwrap();
     assert_eq!(metrics.len(), types.len());
     let started = metrics.iter().find(|metric| metric["name"] == "process_start_time_seconds").unwrap();
-    let started = started["points"][0]["value"].as_f64().unwrap();
+    let started = value_of(&started["points"][0]);
     for metric in metrics {
         let name = metric["name"].as_str().unwrap();
         let is_counter = types[name] == "counter";

@@ -112,12 +112,13 @@ mod tests {
 
     #[test]
     fn log_targets_list_every_crate_that_logs() {
-        const SILENT: [&str; 10] = [
+        const SILENT: [&str; 11] = [
             "sgc_config",
             "sgc_dashboard",
             "sgc_diagnosis",
             "sgc_executor",
             "sgc_fuzz_targets",
+            "sgc_otlp",
             "sgc_process",
             "sgc_session",
             "sgc_sync",

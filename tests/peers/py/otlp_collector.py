@@ -30,7 +30,8 @@ def described(metric):
         points.append(
             {
                 "labels": pairs(point.attributes),
-                "value": point.as_double,
+                # As text, since not every reader of JSON rounds numbers correctly.
+                "value": repr(point.as_double),
                 "start": point.start_time_unix_nano,
                 "time": point.time_unix_nano,
             }
