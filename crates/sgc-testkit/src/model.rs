@@ -161,7 +161,9 @@ fn permits(world: &World, owner: NodeKey, sharing: &Sharing, user: NodeKey) -> b
     let in_fleet = same_fleet(world, owner, user);
     let in_group = member.groups.iter().any(|g| sharing.groups.contains(g));
     let good = world.believes(owner, user);
-    good && !member.router && in_fleet && (sharing.fleet || sharing.nodes.contains(&user) || in_group)
+    // A rule for all members names nobody who may route.
+    let by_fleet = sharing.fleet && !member.may_route;
+    good && !member.router && in_fleet && (by_fleet || sharing.nodes.contains(&user) || in_group)
 }
 
 fn same_fleet(world: &World, a: NodeKey, b: NodeKey) -> bool {
