@@ -21,10 +21,13 @@ const RTT_MIN_MAX: Duration = Duration::from_millis(5);
 /// Packets after which loss is judged.
 const JUDGED_PACKETS: u64 = 1000;
 /// One lost packet in this many is too much for TCP.
-const LOSS_DIVISOR: u64 = 1000;
-/// Longest time that a lane's peer may owe an answer, and longest smoothed round trip of a lane.
+const LOSS_DIVISOR: u64 = 200;
+/// Longest time that a lane's peer may owe an answer.
 const STALLED_AFTER: Duration = Duration::from_secs(1);
+/// Longest smoothed round trip of a lane in use, and the time for which it may be longer: a lane begins with its
+/// handshake's, and busy processors delay answers in passing.
 const LANE_RTT_MAX: Duration = Duration::from_millis(100);
+const SLOW_MAX: Duration = Duration::from_secs(5);
 /// Time without bytes of data after which a lane ends.
 const UNUSED_MAX: Duration = Duration::from_secs(30);
 /// Time in which a lane has to be up.
@@ -32,7 +35,7 @@ const MADE_WITHIN: Duration = Duration::from_secs(20);
 /// Bytes between two looks that are no data: pings and frames of keep-alive.
 const IDLE_BYTES_MAX: u64 = 16 << 10;
 /// Time without lanes after the first failure in a row; it doubles with each.
-const PENALTY_MIN: Duration = Duration::from_secs(30);
+const PENALTY_MIN: Duration = Duration::from_secs(10);
 /// Longest time without lanes after a failure.
 const PENALTY_MAX: Duration = Duration::from_secs(600);
 /// Time of use after which a lane counts as a success: earlier failures are forgotten.
@@ -104,8 +107,8 @@ impl BulkEnd {
     /// Returns `true` if the path is to blame, so that no lane is tried for a while.
     fn is_failure(self) -> bool {
         match self {
-            Self::Lossy | Self::Stalled | Self::NotMade => true,
-            Self::PathChanged | Self::Slow | Self::Unused => false,
+            Self::Stalled | Self::NotMade => true,
+            Self::PathChanged | Self::Slow | Self::Lossy | Self::Unused => false,
         }
     }
 }
@@ -114,6 +117,8 @@ impl BulkEnd {
 #[derive(Debug, Default)]
 pub struct BulkPath {
     is_short: bool,
+    /// Whether the last packets that were judged got lost too often.
+    is_lossy: bool,
     /// Counters of packets, sent and lost, at the beginning of the present judgement of loss.
     judged_from: (u64, u64),
     /// Failures in a row, and the time before which no lane is tried.
@@ -124,14 +129,14 @@ pub struct BulkPath {
 impl BulkPath {
     /// Returns `true` if a lane may be tried now.
     pub fn is_open(&self, now: Instant) -> bool {
-        self.is_short && self.closed_until.is_none_or(|until| until <= now)
+        self.is_short && !self.is_lossy && self.closed_until.is_none_or(|until| until <= now)
     }
 
     /// Takes measurements of the link. Returns the reason if lanes that are up have to end.
     pub fn observe(&mut self, now: Instant, seen: &BulkPathObservation) -> Option<BulkEnd> {
         self.is_short = !seen.rtt_min.is_zero() && seen.rtt_min <= RTT_MIN_MAX;
-        let is_lossy = self.judge_loss(seen);
-        let end = if self.is_short { is_lossy.then_some(BulkEnd::Lossy) } else { Some(BulkEnd::Slow) };
+        self.judge_loss(seen);
+        let end = if self.is_short { self.is_lossy.then_some(BulkEnd::Lossy) } else { Some(BulkEnd::Slow) };
         self.note_end(now, end)
     }
 
@@ -146,14 +151,21 @@ impl BulkPath {
             let end = (now.saturating_duration_since(lane.since) > MADE_WITHIN).then_some(BulkEnd::NotMade);
             return self.note_end(now, end);
         };
-        if seen.bytes.saturating_sub(lane.bytes) > IDLE_BYTES_MAX {
+        let is_in_use = seen.bytes.saturating_sub(lane.bytes) > IDLE_BYTES_MAX;
+        if is_in_use {
             lane.used = now;
         }
         lane.bytes = seen.bytes;
+        if seen.rtt <= LANE_RTT_MAX {
+            lane.slow_since = None;
+        } else if is_in_use {
+            lane.slow_since.get_or_insert(now);
+        }
+        let is_slow = lane.slow_since.is_some_and(|since| now.saturating_duration_since(since) > SLOW_MAX);
         let owes = seen.waits_since.is_some_and(|since| now.saturating_duration_since(since) > STALLED_AFTER);
         let end = if seen.remote != lane.remote {
             Some(BulkEnd::PathChanged)
-        } else if owes || seen.rtt > LANE_RTT_MAX {
+        } else if owes || is_slow {
             Some(BulkEnd::Stalled)
         } else {
             (now.saturating_duration_since(lane.used) > UNUSED_MAX).then_some(BulkEnd::Unused)
@@ -171,14 +183,15 @@ impl BulkPath {
         self.closed_until = Some(now + doubled.min(PENALTY_MAX));
     }
 
-    /// Returns `true` if the link lost too many of the packets since the last judgement.
-    fn judge_loss(&mut self, seen: &BulkPathObservation) -> bool {
+    /// Judges how many of the packets since the last judgement the link lost.
+    fn judge_loss(&mut self, seen: &BulkPathObservation) {
         let (sent, lost) = self.judged_from;
         let (sent, lost) = (seen.sent_packets.saturating_sub(sent), seen.lost_packets.saturating_sub(lost));
-        if sent >= JUDGED_PACKETS {
+        let is_lossy = lost > sent.max(JUDGED_PACKETS) / LOSS_DIVISOR;
+        if is_lossy || sent >= JUDGED_PACKETS {
             self.judged_from = (seen.sent_packets, seen.lost_packets);
+            self.is_lossy = is_lossy;
         }
-        lost > sent.max(JUDGED_PACKETS) / LOSS_DIVISOR
     }
 
     fn note_end(&mut self, now: Instant, end: Option<BulkEnd>) -> Option<BulkEnd> {
@@ -196,13 +209,15 @@ pub struct BulkLaneUse {
     remote: IpAddr,
     since: Instant,
     used: Instant,
+    /// Since when round trips of the lane in use are long.
+    slow_since: Option<Instant>,
     bytes: u64,
 }
 
 impl BulkLaneUse {
     /// Returns the use of a lane that begins now, beside a link whose peer has this address.
     pub fn new(now: Instant, remote: IpAddr) -> Self {
-        Self { remote, since: now, used: now, bytes: 0 }
+        Self { remote, since: now, used: now, slow_since: None, bytes: 0 }
     }
 
     /// Returns `true` if data came lately, so that an end of the lane is none for lack of use.
@@ -256,10 +271,13 @@ mod tests {
         assert!(!path.is_open(now));
         assert_eq!(path.observe(now, &quiet(20)), None);
         assert!(path.is_open(now), "a long path is no failure");
-        let lossy = BulkPathObservation { lost_packets: 3, ..quiet(1500) };
+        let lossy = BulkPathObservation { lost_packets: 8, ..quiet(1500) };
         assert_eq!(path.observe(now, &lossy), Some(BulkEnd::Lossy));
-        assert!(!path.is_open(now + PENALTY_MIN - LOOK));
-        assert!(path.is_open(now + PENALTY_MIN));
+        assert!(!path.is_open(now + PENALTY_MAX), "until packets arrive again");
+        path.observe(now, &BulkPathObservation { lost_packets: 8, ..quiet(2000) });
+        assert!(!path.is_open(now), "too few to tell");
+        assert_eq!(path.observe(now, &BulkPathObservation { lost_packets: 8, ..quiet(2500) }), None);
+        assert!(path.is_open(now));
     }
 
     #[test]
@@ -267,10 +285,10 @@ mod tests {
         let (mut path, mut now) = (BulkPath::default(), Instant::now());
         for n in 1..1000 {
             now += LOOK;
-            let seen = BulkPathObservation { lost_packets: n / 2, ..quiet(n * 1000) };
-            assert_eq!(path.observe(now, &seen), None, "one packet of 2000");
+            let seen = BulkPathObservation { lost_packets: 4 * n, ..quiet(n * 1000) };
+            assert_eq!(path.observe(now, &seen), None, "one packet of 250");
         }
-        let seen = BulkPathObservation { lost_packets: 600, ..quiet(1_000_000) };
+        let seen = BulkPathObservation { lost_packets: 4 * 999 + 6, ..quiet(1_000_000) };
         assert_eq!(path.observe(now, &seen), Some(BulkEnd::Lossy));
     }
 
@@ -306,6 +324,20 @@ mod tests {
         }
         assert_eq!(waits[..3], [PENALTY_MIN, PENALTY_MIN * 2, PENALTY_MIN * 4]);
         assert_eq!(waits[7], PENALTY_MAX);
+    }
+
+    #[test]
+    fn long_round_trips_end_a_lane_only_if_they_last() {
+        let (mut path, start) = (BulkPath::default(), Instant::now());
+        let mut lane = BulkLaneUse::new(start, host(1));
+        let slow = |n: u32| BulkLaneObservation { rtt: 2 * LANE_RTT_MAX, ..busy(u64::from(n) << 20) };
+        // The first is the handshake's.
+        assert_eq!(path.observe_lane(start, &mut lane, Some(&slow(1))), None);
+        assert_eq!(path.observe_lane(start + LOOK, &mut lane, Some(&busy(2 << 20))), None);
+        let ended =
+            (3..100).find(|n| path.observe_lane(start + LOOK * *n, &mut lane, Some(&slow(*n))).is_some());
+        assert_eq!(ended.map(|n| LOOK * (n - 3)), Some(SLOW_MAX + LOOK));
+        assert!(!path.is_open(start));
     }
 
     #[test]
