@@ -48,14 +48,14 @@ impl Camera {
         Self { talker, listener, next: Cell::new(1) }
     }
 
-    /// Publishes messages as fast as the listener takes them, and checks that each arrives once and in order.
+    /// Publishes messages at once, and checks that each arrives once and in order.
     fn exchange(&self, messages: u64) {
-        for _ in 0..messages {
-            let n = self.next.get();
+        let (first, end) = (self.next.get(), self.next.get() + messages);
+        for n in first..end {
             self.talker.say(format!("{}{n:09}", "0".repeat(LARGE_BYTES - 9)));
-            hears_each(&self.listener, n, n);
-            self.next.set(n + 1);
         }
+        hears_each(&self.listener, first, end - 1);
+        self.next.set(end);
     }
 }
 
@@ -204,6 +204,8 @@ fn large_topic_stays_on_its_link_where_bulk_lanes_are_off_or_their_port_is_taken
         c.transport.bulk_lanes = false;
     });
     let camera = Camera::start(&lab);
-    camera.exchange(60);
+    for _ in 0..6 {
+        camera.exchange(10);
+    }
     assert_eq!((lanes(&robot), lanes(&cloud)), (0, 0));
 }

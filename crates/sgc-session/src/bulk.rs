@@ -31,7 +31,7 @@ const SLOW_MAX: Duration = Duration::from_secs(5);
 /// Time without bytes of data after which a lane ends.
 const UNUSED_MAX: Duration = Duration::from_secs(30);
 /// Time in which a lane has to be up.
-const MADE_WITHIN: Duration = Duration::from_secs(20);
+const MADE_WITHIN: Duration = Duration::from_secs(10);
 /// Bytes between two looks that are no data: pings and frames of keep-alive.
 const IDLE_BYTES_MAX: u64 = 16 << 10;
 /// Time without lanes after the first failure in a row; it doubles with each.
@@ -129,12 +129,19 @@ pub struct BulkPath {
 impl BulkPath {
     /// Returns `true` if a lane may be tried now.
     pub fn is_open(&self, now: Instant) -> bool {
-        self.is_short && !self.is_lossy && self.closed_until.is_none_or(|until| until <= now)
+        self.is_short && !self.is_lossy && !self.is_paused(now)
+    }
+
+    /// Returns `true` if no lane may be tried because one failed lately, whatever the path is like. The peer that asks
+    /// for a lane has judged the path, and knows it from the data that it sends.
+    pub fn is_paused(&self, now: Instant) -> bool {
+        self.closed_until.is_some_and(|until| until > now)
     }
 
     /// Takes measurements of the link. Returns the reason if lanes that are up have to end.
     pub fn observe(&mut self, now: Instant, seen: &BulkPathObservation) -> Option<BulkEnd> {
-        self.is_short = !seen.rtt_min.is_zero() && seen.rtt_min <= RTT_MIN_MAX;
+        // A busy host measures 0 now and then. Before the first measurement it is QUIC's assumption, which is long.
+        self.is_short = seen.rtt_min <= RTT_MIN_MAX;
         self.judge_loss(seen);
         let end = if self.is_short { self.is_lossy.then_some(BulkEnd::Lossy) } else { Some(BulkEnd::Slow) };
         self.note_end(now, end)

@@ -284,11 +284,9 @@ impl Lanes {
         }
         let now = Instant::now();
         let mut table = self.table();
-        if table.lanes.contains_key(&name) || !table.path.is_open(now) {
-            return;
-        }
         let bulk = table.lanes.values().filter(|lane| lane.is_bulk()).count();
-        if bulk >= BULK_LANES_MAX || !self.admit_bulk(&mut table, name, now) {
+        let may_ask = table.path.is_open(now) && bulk < BULK_LANES_MAX;
+        if !may_ask || !self.admit_bulk(&mut table, name, now) {
             return;
         }
         drop(table);
@@ -370,7 +368,11 @@ impl Lanes {
                 Ok(())
             }
             (Control::BulkLaneWanted { name }, Some(_)) => {
-                self.ask_for_bulk(*name);
+                let now = Instant::now();
+                let mut table = self.table();
+                if table.path.is_paused(now) || !self.admit_bulk(&mut table, *name, now) {
+                    debug!(name = %name.short(), "the peer requests a bulk lane that it does not get");
+                }
                 Ok(())
             }
             (frame, Some(_)) => Err(format!("a lane is not the dialled node's to offer: {frame:?}")),
@@ -406,10 +408,10 @@ impl Lanes {
         true
     }
 
-    /// Adds a bulk lane for a name without a lane to the table, and dials it if this node does. Returns `false` if there
-    /// is no room.
+    /// Adds a bulk lane for a name to the table, and dials it if this node does. Returns `false` if the name has a lane,
+    /// or there is no room.
     fn admit_bulk(self: &Arc<Self>, table: &mut Table, name: Name, now: Instant) -> bool {
-        if table.lanes.len() >= LANES_MAX {
+        if table.lanes.contains_key(&name) || table.lanes.len() >= LANES_MAX || !self.link.has_bulk_lanes() {
             return false;
         }
         let keeper = self.dial.as_ref().map(|(dialer, _)| {
