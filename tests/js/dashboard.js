@@ -75,7 +75,7 @@ try {
   for (const [rule, column, rights] of [
     ["arm-00 /odom", "arm-00", "own"],
     ["arm-00 /odom", "arm-01", "sub"],
-    ["arm-00 /odom", "router", "sub"],
+    ["arm-00 /odom", "router", ""],
     ["arm-00 /cmd_vel", "router", ""],
     ["arm-00 /odom", "partner:acme", "sub"],
     ["arm-00 /cmd_vel", "desk", "sub pub"],
