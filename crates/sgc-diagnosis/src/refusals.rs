@@ -801,7 +801,7 @@ fn fixes(why: &str) -> Option<(&'static str, &'static str)> {
     JOINS.iter().find(|(answer, ..)| answer.is_said_as(why)).map(|(_, owner, asker)| (*owner, *asker))
 }
 
-/// What a failure says whose cause is the look-up of the router's name.
+/// The words of a failure that the look-up of the router's name caused.
 const LOOKUPS: [&str; 3] =
     ["cannot be looked up", "has no address", "the system's DNS servers are not known"];
 
