@@ -50,23 +50,19 @@ impl Listener {
                 };
                 let listener = bind(credentials.clone(), options.clone(), Arc::clone(&metrics))?;
                 let local = listener.local_addr();
-                let lanes = match options.bulk_lanes {
-                    BulkLanes::Own if addr.scheme == Scheme::Quic => {
-                        let addr = ListenAddr::new(Scheme::Tls, local);
-                        let lanes = StreamListener::bind_for_lanes(&addr, credentials, options, metrics);
-                        lanes.inspect_err(|error| note_taken(local, error)).ok()
-                    }
-                    BulkLanes::Own | BulkLanes::Off => None,
-                    BulkLanes::ByTlsListener => {
-                        listener.announce_bulk_lanes();
-                        None
-                    }
+                let announced_by_tls = options.bulk_lanes == BulkLanes::ByTlsListener;
+                let lanes = if options.bulk_lanes == BulkLanes::Own && addr.scheme == Scheme::Quic {
+                    let addr = ListenAddr::new(Scheme::Tls, local);
+                    let lanes = StreamListener::bind_for_lanes(&addr, credentials, options, metrics);
+                    lanes.inspect_err(|error| note_taken(local, error)).ok()
+                } else {
+                    None
                 };
+                if announced_by_tls || lanes.is_some() {
+                    listener.announce_bulk_lanes();
+                }
                 match lanes {
-                    Some(lanes) => {
-                        listener.announce_bulk_lanes();
-                        (local, Kind::QuicWithLanes(listener, lanes))
-                    }
+                    Some(lanes) => (local, Kind::QuicWithLanes(listener, lanes)),
                     None => (local, Kind::Quic(listener)),
                 }
             }

@@ -52,3 +52,11 @@ pub struct LinkStats {
     /// pings.
     pub waits_since: Option<Instant>,
 }
+
+impl LinkStats {
+    /// Returns a total of sent and received bytes with those of this link added.
+    #[must_use]
+    pub fn added_to(&self, (sent, received): (u64, u64)) -> (u64, u64) {
+        (sent.saturating_add(self.sent_bytes), received.saturating_add(self.received_bytes))
+    }
+}

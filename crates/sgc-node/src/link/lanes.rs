@@ -178,13 +178,8 @@ impl Table {
 
     /// Keeps the counters of a connection that carries no more packets.
     fn put_away(&mut self, up: &AnyLink) {
-        self.ended_bytes = plus(self.ended_bytes, &up.stats());
+        self.ended_bytes = up.stats().added_to(self.ended_bytes);
     }
-}
-
-/// Adds the bytes of a connection to a total of sent and received bytes.
-fn plus((sent, received): (u64, u64), stats: &LinkStats) -> (u64, u64) {
-    (sent.saturating_add(stats.sent_bytes), received.saturating_add(stats.received_bytes))
 }
 
 /// Reasons why a lane is missing.
@@ -245,7 +240,7 @@ impl Lanes {
     pub(crate) fn bytes(&self) -> (u64, u64) {
         let table = self.table();
         let up = table.lanes.values().filter_map(|lane| lane.up.as_ref());
-        up.fold(table.ended_bytes, |total, (_, lane)| plus(total, &lane.stats()))
+        up.fold(table.ended_bytes, |total, (_, lane)| lane.stats().added_to(total))
     }
 
     /// Starts or stops to want a dedicated lane for a name.

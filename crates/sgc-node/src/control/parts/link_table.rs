@@ -95,7 +95,7 @@ impl LinkTable {
     pub(crate) fn remove(&mut self, id: LinkId) -> Option<EndedLink> {
         let entry = self.links.remove(&id)?;
         let (node, remote) = (entry.peer().node_id, entry.remote());
-        self.ended_bytes = plus(self.ended_bytes, &entry.stats());
+        self.ended_bytes = entry.stats().added_to(self.ended_bytes);
         self.policies.remember(node, entry.keep_alive.policy());
         entry.flows.values().for_each(|flow| flow.close());
         Some(EndedLink { node, remote, closed_for: entry.closed_for })
@@ -108,7 +108,7 @@ impl LinkTable {
 
     /// Returns the numbers of bytes that were sent and received over all links since the start.
     pub(crate) fn total_bytes(&self) -> (u64, u64) {
-        self.links.values().fold(self.ended_bytes, |total, entry| plus(total, &entry.stats()))
+        self.links.values().fold(self.ended_bytes, |total, entry| entry.stats().added_to(total))
     }
 
     pub(crate) fn get(&self, id: LinkId) -> Option<&LinkEntry> {
@@ -205,11 +205,6 @@ impl LinkTable {
         };
         self.links.values().map(leave).collect()
     }
-}
-
-/// Adds the bytes of a link to a total of sent and received bytes.
-fn plus((sent, received): (u64, u64), link: &LinkStats) -> (u64, u64) {
-    (sent.saturating_add(link.sent_bytes), received.saturating_add(link.received_bytes))
 }
 
 impl LinkEntry {
