@@ -2,6 +2,7 @@
 """
 
 import argparse
+import faulthandler
 import json
 import signal
 import struct
@@ -52,7 +53,16 @@ class Camera(LifecycleNode):
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__("camera", namespace=options.namespace)
         self.status = self.create_lifecycle_publisher(String, "~/status", 10)
-        self.create_timer(0.05, lambda: self.status.publish(String(data="active")))
+        self.watchers = 0
+        self.create_timer(0.05, self.tick)
+
+    def tick(self) -> None:
+        self.status.publish(String(data="active"))
+        # The publisher of a lifecycle has no callback for it.
+        watchers = self.count_subscribers("~/transition_event")
+        if watchers != self.watchers:
+            self.watchers = watchers
+            say("matched", count=watchers)
 
     def on_configure(self, state) -> TransitionCallbackReturn:
         return TransitionCallbackReturn.SUCCESS
@@ -70,7 +80,7 @@ class Camera(LifecycleNode):
 
 
 class Manager(Node):
-    """Leads a camera through its lifecycle, and reports its states, answers and events."""
+    """Leads a camera through its lifecycle at a line of standard input, and reports its states, answers and events."""
 
     STEPS = [
         Transition.TRANSITION_CONFIGURE,
@@ -91,7 +101,7 @@ class Manager(Node):
         self.change = self.create_client(ChangeState, f"{name}/change_state")
         self.state = self.create_client(GetState, f"{name}/get_state")
         self.list = self.create_client(GetAvailableTransitions, f"{name}/get_available_transitions")
-        threading.Thread(target=self.manage, daemon=True).start()
+        lines(self.manage)
 
     def note(self, event: TransitionEvent) -> None:
         self.events.append(f"{event.start_state.label}-{event.goal_state.label}")
@@ -372,6 +382,8 @@ def main() -> None:
     executor.add_node(node)
     while not ended.is_set():
         executor.spin_once(timeout_sec=0.1)
+    # A library that does not let go is named in the log of a test that waits for the summary.
+    faulthandler.dump_traceback_later(60)
     # Lets others know at once that the node is gone.
     executor.shutdown()
     node.destroy_node()

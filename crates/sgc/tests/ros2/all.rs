@@ -70,8 +70,10 @@ fn lifecycle_of_a_far_node_is_led_as_that_of_a_near_one() {
     let lab = with_service_and_topic("/robot/camera/*", "/robot/camera/*");
     for [serves, manages] in PAIRS {
         let [native, carried] = [(Site::Desk, "/near"), (Site::Robot, "/robot")].map(|(site, namespace)| {
-            let camera = start(&lab, site, serves, &["camera", "--namespace", namespace]);
+            let mut camera = start(&lab, site, serves, &["camera", "--namespace", namespace]);
             let mut manager = start(&lab, Site::Desk, manages, &["manage", "--namespace", namespace]);
+            camera.wait_matched("a subscriber to the camera's events");
+            manager.go();
             let managed = manager.wait("the end of its life", |e| e["event"] == "managed");
             end([camera, manager]);
             managed
