@@ -1,13 +1,20 @@
-//! A queue between two tasks, bounded in items and in bytes, lock-free in the common case, for one consumer.
+//! A queue between two tasks, bounded in items and in bytes, for one consumer.
 //!
 //! The producer chooses the behaviour of a full queue: [`Queue::push`] waits for room (reliable traffic), and
 //! [`Queue::push_evicting`] drops the oldest items (best effort).
+//!
+//! Memory follows the items. A router has a queue for each name and sink, and most are empty most of the time.
 
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::collections::VecDeque;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use crossbeam_queue::ArrayQueue;
+use sgc_sync::lock;
 use tokio::sync::Notify;
+
+/// Items for which a queue keeps room, however few it has.
+const ROOM_MIN: usize = 32;
 
 /// Reasons why an item was not queued.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,8 +37,8 @@ pub(crate) enum PushOutcome<T> {
 
 /// A bounded queue with one consumer.
 pub(crate) struct Queue<T> {
-    items: ArrayQueue<(T, usize)>,
-    bytes: AtomicUsize,
+    items: Mutex<Items<T>>,
+    items_max: usize,
     closed: AtomicBool,
     /// Set when a producer gave up waiting. Others do not wait until the consumer moves again.
     stalled: AtomicBool,
@@ -39,12 +46,51 @@ pub(crate) struct Queue<T> {
     drained: Notify,
 }
 
+/// Queued items, the oldest first.
+struct Items<T> {
+    queue: VecDeque<(T, usize)>,
+    bytes: usize,
+    /// Most items at a time since there were none.
+    most: usize,
+}
+
+impl<T> Items<T> {
+    fn has_room(&self, bytes: usize, bytes_max: usize) -> bool {
+        self.bytes == 0 || self.bytes.saturating_add(bytes) <= bytes_max
+    }
+
+    fn push(&mut self, item: T, bytes: usize) {
+        self.queue.push_back((item, bytes));
+        self.bytes += bytes;
+        self.most = self.most.max(self.queue.len());
+    }
+
+    fn pop(&mut self) -> Option<T> {
+        let (item, bytes) = self.queue.pop_front()?;
+        self.bytes -= bytes;
+        if self.queue.is_empty() {
+            self.give_room_back();
+        }
+        Some(item)
+    }
+
+    /// Halves the room of an empty queue that needed less than a quarter of it. So the room of a burst goes, and that of
+    /// steady traffic stays.
+    fn give_room_back(&mut self) {
+        let room = self.queue.capacity();
+        if room > ROOM_MIN && self.most < room / 4 {
+            self.queue.shrink_to((room / 2).max(ROOM_MIN));
+        }
+        self.most = 0;
+    }
+}
+
 impl<T> Queue<T> {
     /// Creates a queue of at most `items_max` items. Each push bounds the bytes; one item may exceed the bound.
     pub(crate) fn new(items_max: usize) -> Self {
         Self {
-            items: ArrayQueue::new(items_max),
-            bytes: AtomicUsize::new(0),
+            items: Mutex::new(Items { queue: VecDeque::new(), bytes: 0, most: 0 }),
+            items_max,
             closed: AtomicBool::new(false),
             stalled: AtomicBool::new(false),
             filled: Notify::new(),
@@ -89,14 +135,17 @@ impl<T> Queue<T> {
 
     /// Queues an item. While there are more than `bytes_max`, the oldest items are passed to `evicted`.
     pub(crate) fn push_evicting(&self, item: T, bytes: usize, bytes_max: usize, mut evicted: impl FnMut(T)) {
-        while !self.has_room(bytes, bytes_max) {
-            let Some(old) = self.take() else { break };
-            evicted(old);
-        }
-        self.bytes.fetch_add(bytes, Ordering::AcqRel);
-        if let Some((old, old_bytes)) = self.items.force_push((item, bytes)) {
-            self.bytes.fetch_sub(old_bytes, Ordering::AcqRel);
-            evicted(old);
+        loop {
+            let mut items = lock(&self.items);
+            if items.queue.len() < self.items_max && items.has_room(bytes, bytes_max) {
+                items.push(item, bytes);
+                break;
+            }
+            let old = items.pop();
+            drop(items);
+            if let Some(old) = old {
+                evicted(old);
+            }
         }
         self.filled.notify_one();
     }
@@ -128,23 +177,24 @@ impl<T> Queue<T> {
 
     /// Returns `true` if the queue is empty.
     pub(crate) fn is_empty(&self) -> bool {
-        self.items.is_empty()
+        lock(&self.items).queue.is_empty()
     }
 
     /// Returns the number of queued items.
     pub(crate) fn len(&self) -> usize {
-        self.items.len()
+        lock(&self.items).queue.len()
     }
 
     /// Returns `true` if the queue is less than half full.
     pub(crate) fn has_headroom(&self, bytes_max: usize) -> bool {
-        self.items.len() < self.items.capacity() / 2 && self.bytes.load(Ordering::Acquire) < bytes_max / 2
+        let items = lock(&self.items);
+        items.queue.len() < self.items_max / 2 && items.bytes < bytes_max / 2
     }
 
     /// Returns the number of queued bytes.
     #[cfg(test)]
     pub(crate) fn bytes(&self) -> usize {
-        self.bytes.load(Ordering::Acquire)
+        lock(&self.items).bytes
     }
 
     /// Returns `true` if the queue is closed.
@@ -154,30 +204,18 @@ impl<T> Queue<T> {
 
     /// Queues an item if there is room.
     pub(crate) fn try_push(&self, item: T, bytes: usize, bytes_max: usize) -> PushOutcome<T> {
-        if self.is_closed() || !self.has_room(bytes, bytes_max) {
+        let mut items = lock(&self.items);
+        if self.is_closed() || items.queue.len() >= self.items_max || !items.has_room(bytes, bytes_max) {
             return PushOutcome::NotQueued(item);
         }
-        self.bytes.fetch_add(bytes, Ordering::AcqRel);
-        match self.items.push((item, bytes)) {
-            Ok(()) => {
-                self.filled.notify_one();
-                PushOutcome::Queued
-            }
-            Err((item, _)) => {
-                self.bytes.fetch_sub(bytes, Ordering::AcqRel);
-                PushOutcome::NotQueued(item)
-            }
-        }
-    }
-
-    fn has_room(&self, bytes: usize, bytes_max: usize) -> bool {
-        let used = self.bytes.load(Ordering::Acquire);
-        used == 0 || used + bytes <= bytes_max
+        items.push(item, bytes);
+        drop(items);
+        self.filled.notify_one();
+        PushOutcome::Queued
     }
 
     fn take(&self) -> Option<T> {
-        let (item, bytes) = self.items.pop()?;
-        self.bytes.fetch_sub(bytes, Ordering::AcqRel);
+        let item = lock(&self.items).pop()?;
         self.stalled.store(false, Ordering::Relaxed);
         self.drained.notify_waiters();
         Some(item)
@@ -236,5 +274,23 @@ mod tests {
         let queue = Queue::new(3);
         queue.push(1, 1_000_000, 10, PATIENCE).await.unwrap();
         assert_eq!(queue.pop().await, Some(1));
+    }
+
+    #[test]
+    fn room_of_a_burst_is_given_back_and_that_of_steady_traffic_is_kept() {
+        let queue = Queue::new(1024);
+        let room = || lock(&queue.items).queue.capacity();
+        let pass = |burst: usize| {
+            for n in 0..burst {
+                assert_eq!(queue.try_push(n, 1, 10_000), PushOutcome::Queued);
+            }
+            (0..burst).for_each(|n| assert_eq!(queue.try_pop(), Some(n)));
+        };
+        assert_eq!(room(), 0, "an unused queue has none");
+        pass(1024);
+        (0..9).for_each(|_| pass(300));
+        assert!(room() >= 1024, "{}", room());
+        (0..9).for_each(|_| pass(1));
+        assert!(room() <= 2 * ROOM_MIN, "{}", room());
     }
 }
