@@ -4,7 +4,7 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::LevelFilter;
 
 /// The log targets: the names of the crates that log.
-const LOG_TARGETS: [&str; 15] = [
+const LOG_TARGETS: [&str; 16] = [
     "sgc",
     "sgc_cdr",
     "sgc_dds",
@@ -16,6 +16,7 @@ const LOG_TARGETS: [&str; 15] = [
     "sgc_node",
     "sgc_ros",
     "sgc_router",
+    "sgc_sync",
     "sgc_transport",
     "sgc_trust",
     "sgc_types",
@@ -87,9 +88,15 @@ mod tests {
 
     #[test]
     fn log_filter_consists_of_levels_and_targets() {
-        for right in
-            ["info", "WARN", "off", "sgc_node=debug,info", "sgc_node::core=trace, quinn=off", "sgc=info"]
-        {
+        for right in [
+            "info",
+            "WARN",
+            "off",
+            "sgc_node=debug,info",
+            "sgc_node::core=trace, quinn=off",
+            "sgc=info",
+            "sgc_sync=debug",
+        ] {
             assert!(log_filter(right).is_ok(), "{right}");
         }
         let level = |written: &str| LogFilterError::Level { written: written.to_owned() };
@@ -112,7 +119,7 @@ mod tests {
 
     #[test]
     fn log_targets_list_every_crate_that_logs() {
-        const SILENT: [&str; 11] = [
+        const SILENT: [&str; 10] = [
             "sgc_config",
             "sgc_dashboard",
             "sgc_diagnosis",
@@ -121,7 +128,6 @@ mod tests {
             "sgc_otlp",
             "sgc_process",
             "sgc_session",
-            "sgc_sync",
             "sgc_testkit",
             "sgc_websocket",
         ];
