@@ -55,4 +55,4 @@ pub use node::{
 };
 pub use state::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use state::run_lock::IdentityInUse;
-pub use state::{StateError, check_state_dir, create_state_dir, state_bases, state_dir};
+pub use state::{StateError, check_state_dir, create_state_dir, state_bases, state_dir, storage_fault};

@@ -16,7 +16,10 @@ use sgc_gateway::AccessTokenError;
 use sgc_measure::MeasureError;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
-use sgc_node::{AccessError, FleetFileError, GatewayCertificateError, NodeError, RulesError, StateError};
+use sgc_node::{
+    AccessError, FleetFileError, GatewayCertificateError, GatewayStartError, NodeError, RulesError,
+    StateError,
+};
 use sgc_process::{ProcessError, output};
 use sgc_trust::{CrlError, FleetError, IdentityError, InvitationError, LabelError, PemError, TokenError};
 
@@ -370,6 +373,7 @@ impl CliError {
                 | NodeError::Randomness(_),
             ) => EXIT_FAILURE,
             Self::Node(NodeError::IdentityFile { source, .. }) if !is_lacking(source) => EXIT_FAILURE,
+            Self::Node(NodeError::Gateway(error)) if is_gateway_io(error) => EXIT_FAILURE,
             Self::Node(_) => EXIT_USAGE,
             Self::Process(_)
             | Self::FleetFile(FleetFileError::Read { .. } | FleetFileError::Write { .. })
@@ -481,6 +485,14 @@ fn count(errors: &ConfigErrors) -> String {
         1 => "1 mistake".to_owned(),
         n => format!("{n} mistakes"),
     }
+}
+
+/// Returns `true` if reading or writing the gateway's certificate failed for a cause that may go away by itself.
+fn is_gateway_io(error: &GatewayStartError) -> bool {
+    let GatewayStartError::Certificate(GatewayCertificateError::File { source, .. }) = error else {
+        return false;
+    };
+    !is_lacking(source)
 }
 
 /// Returns `true` if a file is missing or belongs to somebody else, which another start does not change.

@@ -1,5 +1,5 @@
 //! Faults around a node that an operator mends while the node runs: a wrong clock, a certificate that has ended, a name
-//! of the router that DNS does not know yet. The log, `sgc status`, `sgc why` and `sgc check` name cause and remedy, and
+//! of the router that DNS does not know yet, a disk that is full or read-only. The log, `sgc status`, `sgc why` and `sgc check` name cause and remedy, and
 //! the same process goes on once it is mended.
 
 #![allow(clippy::unwrap_used)]
@@ -9,7 +9,7 @@ mod dns;
 mod support;
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use dns::DnsServer;
@@ -84,11 +84,43 @@ impl Place {
     fn start_cloud(&self) -> Running {
         let text = format!(
             "identity = \"cloud.identity\"\n[node]\nstate = \"cloud.state\"\n[admin]\nsocket = \"cloud.sock\"\n\
-             [router]\nlisten = [\"quic://127.0.0.1:{}\"]\n",
+             [router]\nlisten = [\"quic://{}:{}\"]\n",
+            if self.network.is_some() { "0.0.0.0" } else { "127.0.0.1" },
             self.port()
         );
         fs::write(self.file("cloud.toml"), text).unwrap();
         Running::start(self.sgc(&["run", "-c", "cloud.toml"]), &self.file("cloud.log"))
+    }
+
+    /// Starts the desk with a gateway. `prelude` prepares the disk that only the desk sees.
+    fn start_desk_on(&self, prelude: &str, state: &str) -> Running {
+        let text = format!(
+            "identity = \"desk.identity\"\n[node]\n{state}\nrouters = [\"quic://127.0.0.1:{PORT}\"]\n\
+             [admin]\nsocket = \"desk.sock\"\n[gateway]\nlisten = [\"wss://127.0.0.1:9443\"]\n\
+             [ros]\ndomain_id = 0\ndiscovery_range = \"localhost\"\nstatic_peers = []\n\
+             [[share]]\ntopic = \"{SHARED}\"\nto = [\"*\"]\n"
+        );
+        fs::write(self.file("desk.toml"), text).unwrap();
+        Running::start(self.sgc_on(prelude, &["run", "-c", "desk.toml"]), &self.file("desk.log"))
+    }
+
+    /// Returns the command with a disk that only it sees.
+    fn sgc_on(&self, prelude: &str, args: &[&str]) -> Command {
+        let mut command = support::command(self.network.as_ref(), self.dir.path(), Path::new("sh"));
+        command.args(["-c", &format!("{prelude} && exec \"$@\""), "sh", env!("CARGO_BIN_EXE_sgc")]);
+        command.args(args).env("SGC_ALLOW_CORE_DUMPS", "1");
+        command
+    }
+
+    /// Returns the pin that the log of the desk names.
+    fn pin(&self) -> String {
+        let log = self.log();
+        let (_, pin) = log.split_once("a certificate with the pin ").unwrap();
+        pin.split(' ').next().unwrap().to_owned()
+    }
+
+    fn has_alert(&self, kind: &str) -> bool {
+        self.status()["alerts"].as_array().is_some_and(|all| all.iter().any(|alert| alert["kind"] == kind))
     }
 
     /// Starts the desk, which dials a router at `host`.
@@ -256,4 +288,82 @@ fn node_without_a_dns_server_says_that_nobody_answers() {
         "router.lab.example cannot be looked up",
         "look at the network and at the DNS servers",
     );
+}
+
+/// A state directory of 64 KiB without free space.
+const FULL_DISK: &str = "mkdir -p desk.state && mount -t tmpfs -o size=64k,mode=700 tmpfs desk.state && \
+                         { head -c 1M /dev/zero > desk.state/ballast 2> /dev/null || true; }";
+/// The state directory of before on a read-only mount.
+const READ_ONLY_DISK: &str = "mount --bind desk.state desk.state && mount -o remount,bind,ro desk.state";
+const NOT_KEPT: &str = "nothing is kept over a restart";
+
+#[test]
+fn node_on_a_full_disk_runs_with_a_gateway_and_keeps_its_state_once_there_is_space() {
+    let place = Place::new("full");
+    if place.network.is_none() {
+        return;
+    }
+    place.enroll();
+    let _cloud = place.start_cloud();
+    let desk = place.start_desk_on(FULL_DISK, "state = \"desk.state\"");
+    place.assert_told(SHARED, NOT_KEPT, "free space on its disk");
+    eventually("the desk is linked", || place.is_linked());
+    eventually("the audit log is missed", || place.has_alert("audit_not_written"));
+    let lost = |status: &Value| status["drops"]["audit_lost"].as_u64();
+    eventually("lost records count", || lost(&place.status()).is_some_and(|lost| lost > 0));
+    assert!(!place.pin().is_empty());
+    let state = format!("/proc/{}/root{}", desk.pid(), place.file("desk.state").display());
+    fs::remove_file(Path::new(&state).join("ballast")).unwrap();
+    eventually("the alerts end", || place.status()["alerts"].as_array().is_some_and(Vec::is_empty));
+    place.assert_mended();
+    let audit = fs::read_to_string(Path::new(&state).join("audit.jsonl")).unwrap();
+    assert!(audit.contains("\"audit_lost\""), "{audit}");
+}
+
+#[test]
+fn node_on_a_read_only_disk_runs_with_the_state_that_it_can_read() {
+    let place = Place::new("readonly");
+    if place.network.is_none() {
+        return;
+    }
+    place.enroll();
+    let _cloud = place.start_cloud();
+    let state = "state = \"desk.state\"";
+    drop(place.start_desk_on("true", state));
+    let pin = place.pin();
+    fs::remove_file(place.file("desk.log")).unwrap();
+    let _desk = place.start_desk_on(READ_ONLY_DISK, state);
+    place.assert_told(SHARED, NOT_KEPT, "mount it to be written");
+    eventually("the desk is linked", || place.is_linked());
+    assert!(place.has_alert("audit_not_written"));
+    assert_eq!(place.pin(), pin);
+    let check = place.sgc_on(READ_ONLY_DISK, &["check", "-c", "desk.toml"]).output().unwrap();
+    let check = String::from_utf8(check.stdout).unwrap();
+    assert!(check.contains(NOT_KEPT), "{check}");
+}
+
+#[test]
+fn node_of_a_user_without_a_home_says_that_nothing_is_kept() {
+    let place = Place::new("homeless");
+    if place.network.is_none() {
+        return;
+    }
+    place.enroll();
+    let _cloud = place.start_cloud();
+    let _desk = place.start_desk_on("true", "");
+    place.assert_told(SHARED, NOT_KEPT, "set `state` in [node]");
+    assert!(place.has_alert("state_not_kept"));
+}
+
+#[test]
+fn node_that_starts_before_its_host_has_an_address_links_once_it_has_one() {
+    let place = Place::new("boot");
+    let Some(network) = &place.network else { return };
+    place.enroll();
+    let _cloud = place.start_cloud();
+    let _desk = place.start_desk("10.77.0.1", "");
+    eventually("the desk tries", || place.asked(&["status"]).contains("no answer within"));
+    assert!(!place.is_linked());
+    network.ip(&["address", "add", "10.77.0.1/24", "dev", "lo"]).unwrap();
+    place.assert_mended();
 }

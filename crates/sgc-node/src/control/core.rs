@@ -74,6 +74,7 @@ use crate::local::network_state::NetworkState;
 use crate::metrics::Metrics;
 use crate::state::audit::Audit;
 use crate::state::credentials::StateWriter;
+use crate::state::storage::StateStorage;
 
 /// Events handled before the timers are checked again.
 const BATCH_MAX: usize = 256;
@@ -129,6 +130,7 @@ pub(crate) struct Core<N: RosNetwork> {
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
     audit: Audit,
+    storage: StateStorage,
     board: Board,
     refused: Refusals,
     /// Taps of the local network.
@@ -177,6 +179,7 @@ pub(crate) struct CoreParts<N> {
     pub transport: Arc<sgc_transport::TransportMetrics>,
     /// Audit log.
     pub audit: Audit,
+    pub storage: StateStorage,
     /// State of the searches for routers.
     pub(crate) board: Board,
     /// Keep-alive policy of new links.
@@ -247,6 +250,7 @@ impl<N: RosNetwork> Core<N> {
             transport: parts.transport,
             alive: parts.alive,
             audit: parts.audit,
+            storage: parts.storage,
             board: parts.board,
             refused: Refusals::default(),
             types: InterfaceTypes::new(parts.types, parts.definitions),

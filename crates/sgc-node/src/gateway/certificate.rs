@@ -155,20 +155,23 @@ pub(crate) fn kept(
     let path = state.join(FILE);
     let failed = |source| GatewayCertificateError::File { path: path.clone(), source };
     let _lock = StateLock::take(state).map_err(failed)?;
-    let before = match state::read(&path, SERVER_FILE_BYTES_MAX as u64).map_err(failed)? {
-        None => None,
-        Some(bytes) => {
-            let bytes = Zeroizing::new(bytes);
-            let text = String::from_utf8_lossy(&bytes);
-            let broken = |source| GatewayCertificateError::Kept { path: path.clone(), source };
-            Some(ServerCertificate::parse(&text).map_err(broken)?)
-        }
-    };
-    let (certificate, is_new) = current(before, names, now)?;
+    let (certificate, is_new) = current(read(state)?, names, now)?;
     if is_new {
         state::replace(&path, certificate.to_text().as_bytes()).map_err(failed)?;
     }
     Ok(certificate)
+}
+
+/// Reads the gateway's own certificate in the state directory; `None` if there is none yet.
+pub(crate) fn read(state: &Path) -> Result<Option<ServerCertificate>, GatewayCertificateError> {
+    let path = state.join(FILE);
+    let failed = |source| GatewayCertificateError::File { path: path.clone(), source };
+    let Some(bytes) = state::read(&path, SERVER_FILE_BYTES_MAX as u64).map_err(failed)? else {
+        return Ok(None);
+    };
+    let bytes = Zeroizing::new(bytes);
+    let broken = |source| GatewayCertificateError::Kept { path: path.clone(), source };
+    ServerCertificate::parse(&String::from_utf8_lossy(&bytes)).map(Some).map_err(broken)
 }
 
 /// Returns the certificate for these names, and whether it is another than the one before.

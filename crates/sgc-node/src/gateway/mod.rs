@@ -30,6 +30,7 @@ use tracing::{info, warn};
 use self::certificate::{GatewayCertificateError, ShownKey};
 use self::network::{GatewayNetwork, HubNetwork};
 use crate::control::faults::alerts::Alert;
+use crate::state::is_storage_fault;
 
 /// Opens the gateway's part of the local network. May block.
 pub type OpenLocalRos = Arc<dyn Fn() -> Result<Arc<dyn LocalRos>, RosError> + Send + Sync>;
@@ -80,7 +81,7 @@ pub(crate) struct Gateway {
     server: Mutex<Option<Arc<Server>>>,
     /// Held while the shown certificates change, so that a reload does not undo a renewal.
     showing: Mutex<()>,
-    /// The gateway's own certificate, if there is no state directory to keep it in.
+    /// The gateway's own certificate, if the state directory cannot keep it.
     unkept: Mutex<Option<ServerCertificate>>,
 }
 
@@ -225,20 +226,29 @@ impl Gateway {
             return Ok(Some(ShownKey::Files(certificate::key_of_files(tls)?)));
         }
         let names = certificate::wanted_names(config);
-        let Some(state) = state else {
-            let mut unkept = lock(&self.unkept);
-            if unkept.is_none() {
-                warn!(
-                    "the gateway's own certificate is not kept, since there is no state directory: its pin changes at each \
-                     start; set `state` in [node]"
-                );
+        let mut unkept = lock(&self.unkept);
+        let reason = match state.map(|state| certificate::kept(&names, state, now)) {
+            Some(Ok(own)) => {
+                *unkept = None;
+                return Ok(Some(ShownKey::Own(own.certified_key()?)));
             }
-            let (own, _) = certificate::current(unkept.take(), &names, now)?;
-            let key = own.certified_key()?;
-            *unkept = Some(own);
-            return Ok(Some(ShownKey::Own(key)));
+            Some(Err(GatewayCertificateError::File { source, .. })) if is_storage_fault(&source) => {
+                source.to_string()
+            }
+            Some(Err(error)) => return Err(error),
+            None => "there is no state directory; set `state` in [node]".to_owned(),
         };
-        Ok(Some(ShownKey::Own(certificate::kept(&names, state, now)?.certified_key()?)))
+        let mut before = unkept.take();
+        if before.is_none() {
+            warn!(
+                "the gateway's own certificate is not kept, so its pin may change at the next start: {reason}"
+            );
+            before = state.map(certificate::read).transpose()?.flatten();
+        }
+        let (own, _) = certificate::current(before, &names, now)?;
+        let key = own.certified_key()?;
+        *unkept = Some(own);
+        Ok(Some(ShownKey::Own(key)))
     }
 
     /// Replaces the rules and the certificate for programs. Returns `true` if the certificate changed. `identity` is

@@ -43,7 +43,7 @@ use crate::node::random::system_rng;
 use crate::state::audit::{self, Audit, AuditWriter};
 use crate::state::credentials::{StateWriter, with_kept_crls};
 use crate::state::run_lock::RunLock;
-use crate::state::{self, StateError};
+use crate::state::storage::StateStorage;
 
 /// Delay of the transport's own keep-alive behind ours.
 const KEEP_ALIVE_SLACK: Duration = Duration::from_secs(5);
@@ -56,7 +56,7 @@ pub(super) struct NodeParts<N> {
     pub(super) identity: Arc<Identity>,
     pub(super) network: Option<Arc<N>>,
     pub(super) open: Option<OpenNetwork<N>>,
-    pub(super) state: Option<PathBuf>,
+    pub(super) storage: StateStorage,
     pub(super) run_lock: RunLock,
 }
 
@@ -100,7 +100,8 @@ pub(super) async fn build<N: RosNetwork>(
     open_gateway: Option<OpenLocalRos>,
     types: Option<Arc<TypeStore>>,
 ) -> Result<BuiltNode<N>, NodeError> {
-    let NodeParts { config, identity, network, open, state, run_lock } = parts;
+    let NodeParts { config, identity, network, open, storage, run_lock } = parts;
+    let state = storage.dir.clone();
     let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
     let of_metrics = config.metrics.as_ref().map(MetricsConfig::warnings).unwrap_or_default();
     let warnings = config.warnings();
@@ -158,6 +159,7 @@ pub(super) async fn build<N: RosNetwork>(
         events: events.downgrade(),
         transport: sockets.metrics.clone(),
         audit: audit.clone(),
+        storage,
     });
     let channels = CoreChannels { events, inbox, requested, on_redial, all_ended };
     Ok(BuiltNode {
@@ -340,22 +342,6 @@ pub(crate) async fn listen_for_clients(
         })
         .await?;
     Ok(())
-}
-
-/// Returns the state directory and creates it if needed. A node whose user has no home runs without.
-pub(super) fn state_dir(config: &Config, node: &str) -> Result<Option<PathBuf>, NodeError> {
-    let Some(dir) = state::state_dir(config, node) else {
-        warn!("{}; until then nothing is kept, and there is no audit log", StateError::Nowhere);
-        return Ok(None);
-    };
-    match state::create_state_dir(&dir) {
-        Ok(()) => Ok(Some(dir)),
-        Err(error @ StateError::Directory { .. }) if config.state.is_none() => {
-            warn!("{error}; nothing is kept, and there is no audit log: set `state` in [node]");
-            Ok(None)
-        }
-        Err(error) => Err(error.into()),
-    }
 }
 
 fn open_audit(

@@ -28,6 +28,7 @@ use crate::clock::now;
 use crate::control::faults::alerts::clock_alert;
 use crate::control::settings::file_watch::FileWatch;
 use crate::state::run_lock::RunLock;
+use crate::state::storage::StateStorage;
 
 /// Time before its certificate's end at which a node starts to warn.
 const EXPIRY_WARNING: Duration = Duration::from_secs(14 * 86_400);
@@ -95,18 +96,20 @@ async fn run_with<N: RosNetwork>(
 ) -> Result<(), NodeError> {
     let watched = options.file.clone().filter(|_| config.watch);
     let file_watch = watched.map(|file| FileWatch::begin(file, &config));
-    let state = build::state_dir(&config, identity.node_name().as_str())?;
+    let storage = StateStorage::open(&config, identity.node_name().as_str())?;
     let mut shutdown = std::pin::pin!(shutdown);
     let run_lock = tokio::select! {
-        taken = RunLock::take(&config.identity, state.as_deref(), identity.node_id()) => {
+        taken = RunLock::take(&config.identity, storage.dir.as_deref(), identity.node_id()) => {
             taken.map_err(|source| NodeError::IdentityInUse { path: config.identity.clone(), source })?
         }
         () = &mut shutdown => return Ok(()),
     };
-    let parts = build::NodeParts { config, identity, network, open, state, run_lock };
+    let parts = build::NodeParts { config, identity, network, open, storage: storage.clone(), run_lock };
     let node = build::build(parts, options.gateway.take(), options.types.take()).await?;
+    let watching = tokio::spawn(storage.watch());
     let running = spawn::spawn(node, options, file_watch).await?;
     shutdown.await;
+    watching.abort();
     info!("stopping");
     running.drain().await;
     Ok(())

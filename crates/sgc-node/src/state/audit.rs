@@ -37,11 +37,15 @@ use self::recent::Recent;
 use self::record::Cause;
 pub use self::record::{AUDIT_ID_CHARS, AuditEvent, AuditRecord};
 use crate::clock::now;
+use crate::control::faults::alerts::Alert;
+use crate::state::is_storage_fault;
 
 /// Records that may wait to be written.
 const WAITING_MAX: usize = 1024;
 /// Lines written at once.
 const BATCH_MAX: usize = 64;
+/// Interval of attempts to write while the log cannot be written.
+const RETRY_EVERY: Duration = Duration::from_secs(5);
 /// Longest delay of a summary after its hour.
 const SUMMARY_DELAY: Duration = Duration::from_secs(60);
 const FILE_NAME: &str = "audit.jsonl";
@@ -58,11 +62,44 @@ pub struct Audit {
 #[derive(Debug)]
 struct AuditInner {
     records: SyncSender<Option<AuditRecord>>,
-    lost: Arc<AtomicU64>,
+    losses: Arc<Losses>,
     names: ArcSwap<PeerNames>,
     quotas: Arc<Mutex<Quotas>>,
     recent: Mutex<Recent>,
-    lost_total: AtomicU64,
+}
+
+/// Records that are not in the log.
+#[derive(Debug, Default)]
+struct Losses {
+    /// Those that the log has not reported yet.
+    unreported: AtomicU64,
+    /// Those since the node started.
+    total: AtomicU64,
+    /// The file and the error of the last attempt to write, if it failed.
+    failure: Mutex<Option<(PathBuf, String)>>,
+}
+
+impl Losses {
+    fn add(&self, records: u64) {
+        self.unreported.fetch_add(records, Relaxed);
+        self.total.fetch_add(records, Relaxed);
+    }
+
+    fn is_failing(&self) -> bool {
+        lock(&self.failure).is_some()
+    }
+
+    /// Notes a failed attempt to write. The log of the node names the first of several.
+    fn failed(&self, path: &Path, error: &io::Error) {
+        let failure = (path.to_owned(), error.to_string());
+        if lock(&self.failure).replace(failure).is_none() {
+            warn!(path = %path.display(), %error, "the audit log cannot be written; losses are counted");
+        }
+    }
+
+    fn written(&self) {
+        *lock(&self.failure) = None;
+    }
 }
 
 impl AuditInner {
@@ -70,8 +107,7 @@ impl AuditInner {
         match self.records.try_send(Some(record)) {
             Ok(()) => {}
             Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
-                self.lost.fetch_add(1, Relaxed);
-                self.lost_total.fetch_add(1, Relaxed);
+                self.losses.add(1);
             }
         }
     }
@@ -85,23 +121,32 @@ pub struct AuditWriter {
 }
 
 impl Audit {
-    /// Opens the log at `path` and completes a line that an earlier run left unfinished.
+    /// Opens the log at `path` and completes a line that an earlier run left unfinished. If the disk is full or
+    /// read-only, the thread opens the log later.
     pub fn open(path: &Path, room: AuditRoom, names: PeerNames) -> io::Result<(Self, AuditWriter)> {
-        let file = LogFile::open(path, room)?;
+        let losses = Arc::<Losses>::default();
+        let file = match LogFile::open(path, room) {
+            Ok(file) => Some(file),
+            Err(error) if is_storage_fault(&error) => {
+                losses.failed(path, &error);
+                None
+            }
+            Err(error) => return Err(error),
+        };
+        let file = LateFile { path: path.to_owned(), room, file };
         let (records, waiting) = sync_channel(WAITING_MAX);
         // The thread holds no sender, so it ends with the last handle.
-        let (lost, quotas) = (Arc::<AtomicU64>::default(), Arc::<Mutex<Quotas>>::default());
+        let quotas = Arc::<Mutex<Quotas>>::default();
         let shared = Arc::new(AuditInner {
             records,
-            lost: lost.clone(),
+            losses: losses.clone(),
             names: ArcSwap::from_pointee(names),
             quotas: quotas.clone(),
             recent: Mutex::default(),
-            lost_total: AtomicU64::new(0),
         });
         let thread = std::thread::Builder::new()
             .name("sgc-audit".to_owned())
-            .spawn(move || write_all(file, &waiting, &lost, &quotas))?;
+            .spawn(move || write_all(file, &waiting, &losses, &quotas))?;
         let audit = Self { shared: Some(shared.clone()) };
         Ok((audit, AuditWriter { shared, thread }))
     }
@@ -145,7 +190,13 @@ impl Audit {
 
     /// Returns the number of records lost since the node started.
     pub fn lost_total(&self) -> u64 {
-        self.shared.as_ref().map_or(0, |shared| shared.lost_total.load(Relaxed))
+        self.shared.as_ref().map_or(0, |shared| shared.losses.total.load(Relaxed))
+    }
+
+    /// Returns an alert if the last attempt to write the log failed.
+    pub(crate) fn alert(&self) -> Option<Alert> {
+        let (path, reason) = lock(&self.shared.as_ref()?.losses.failure).clone()?;
+        Some(Alert::AuditNotWritten { path: path.display().to_string(), reason })
     }
 
     /// Returns the number of records that only summaries hold, since the node started.
@@ -155,7 +206,7 @@ impl Audit {
 
     /// Returns the number of lost records that the log has not reported yet.
     pub fn lost(&self) -> u64 {
-        self.shared.as_ref().map_or(0, |shared| shared.lost.load(Relaxed))
+        self.shared.as_ref().map_or(0, |shared| shared.losses.unreported.load(Relaxed))
     }
 }
 
@@ -183,17 +234,34 @@ pub fn audit_path(configured: Option<&Path>, state: Option<&Path>) -> Option<Pat
     configured.map(Path::to_owned).or_else(|| Some(state?.join(FILE_NAME)))
 }
 
+/// The file of the log, which is opened later if it could not be opened at first.
+struct LateFile {
+    path: PathBuf,
+    room: AuditRoom,
+    file: Option<LogFile>,
+}
+
+impl LateFile {
+    fn append(&mut self, lines: &str) -> io::Result<()> {
+        let file = match self.file.take() {
+            Some(file) => file,
+            None => LogFile::open(&self.path, self.room)?,
+        };
+        self.file.insert(file).append(lines)
+    }
+}
+
 fn write_all(
-    mut file: LogFile,
+    mut file: LateFile,
     waiting: &Receiver<Option<AuditRecord>>,
-    lost: &AtomicU64,
+    losses: &Losses,
     quotas: &Mutex<Quotas>,
 ) {
-    let mut is_failing = false;
     let mut ends = false;
     while !ends {
         let mut records = Vec::new();
-        match waiting.recv_timeout(SUMMARY_DELAY) {
+        let patience = if losses.is_failing() { RETRY_EVERY } else { SUMMARY_DELAY };
+        match waiting.recv_timeout(patience) {
             Ok(Some(record)) => records.push(record),
             Err(RecvTimeoutError::Timeout) => lock(quotas).sweep(now().unix.0, &mut records),
             Ok(None) | Err(RecvTimeoutError::Disconnected) => ends = true,
@@ -208,8 +276,8 @@ fn write_all(
         if ends {
             lock(quotas).finish(&mut records);
         }
-        let missing = lost.swap(0, Relaxed);
-        if records.is_empty() && missing == 0 {
+        let missing = losses.unreported.swap(0, Relaxed);
+        if records.is_empty() && missing == 0 && !losses.is_failing() {
             continue;
         }
         let mut lines = String::new();
@@ -219,16 +287,17 @@ fn write_all(
             push_line(&mut lines, &record);
         }
         match file.append(&lines) {
-            Ok(()) => is_failing = false,
+            Ok(()) => losses.written(),
             Err(error) => {
-                lost.fetch_add(missing + records.len() as u64, Relaxed);
-                if !std::mem::replace(&mut is_failing, true) {
-                    warn!(path = %file.path().display(), %error, "the audit log cannot be written; losses are counted");
-                }
+                losses.unreported.fetch_add(missing, Relaxed);
+                losses.add(records.len() as u64);
+                losses.failed(&file.path, &error);
             }
         }
     }
-    let _ = file.sync();
+    if let Some(file) = file.file {
+        let _ = file.sync();
+    }
 }
 
 fn push_line(lines: &mut String, record: &AuditRecord) {

@@ -7,6 +7,7 @@ pub(crate) mod credentials;
 pub(crate) mod fleet_file;
 pub(crate) mod records;
 pub(crate) mod run_lock;
+pub(crate) mod storage;
 
 use std::ffi::OsString;
 use std::fs;
@@ -18,6 +19,8 @@ use rustix::fs::{FlockOperation, OFlags, flock};
 use sgc_config::Config;
 
 const LOCK_FILE: &str = "lock";
+/// Name of the file that is written to see whether the directory can be written.
+const PROBE_FILE: &str = ".probe";
 const PERMISSION_BITS: u32 = 0o7777;
 const OTHERS_BITS: u32 = 0o077;
 
@@ -150,6 +153,20 @@ pub(crate) fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
         let _ = fs::remove_file(&temporary);
     }
     written
+}
+
+/// Returns `true` if the disk is full or read-only.
+pub(crate) fn is_storage_fault(error: &io::Error) -> bool {
+    use io::ErrorKind::{QuotaExceeded, ReadOnlyFilesystem, StorageFull};
+    matches!(error.kind(), StorageFull | ReadOnlyFilesystem | QuotaExceeded)
+}
+
+/// Writes a file into the directory and removes it. Returns the error if the disk is full or read-only.
+pub fn storage_fault(dir: &Path) -> Option<io::Error> {
+    let probe = dir.join(PROBE_FILE);
+    let written = replace(&probe, b"probe");
+    let _ = fs::remove_file(&probe);
+    written.err().filter(is_storage_fault)
 }
 
 /// Reads a file of at most `max` bytes that is no symbolic link; `None` if it is missing.

@@ -143,6 +143,7 @@ impl<N: RosNetwork> Core<N> {
         }));
         let closed = self.reopening.failure().map(str::to_owned);
         alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
+        alerts.extend(self.storage.alert().into_iter().chain(self.audit.alert()));
         alerts.extend(strangers::alerts());
         alerts.extend(self.owners_here().into_iter().map(|node| Alert::SameLocalNetwork { node }));
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {

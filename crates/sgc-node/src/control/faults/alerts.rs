@@ -135,6 +135,18 @@ pub enum Alert {
         /// The reason.
         reason: String,
     },
+    /// The state directory is missing, full or read-only, so nothing outlives a restart.
+    StateNotKept {
+        /// The reason.
+        reason: String,
+    },
+    /// The audit log cannot be written.
+    AuditNotWritten {
+        /// The file.
+        path: String,
+        /// The reason.
+        reason: String,
+    },
     /// DDS Security protects both this node and local programs, and one does not admit the other.
     RefusedPrograms {
         /// The enclave that they name, `/` if they have none of their own.
@@ -225,6 +237,14 @@ impl Alert {
                 "look whether a collector takes OTLP over HTTP there, and what its log says; `otlp` in [metrics] names it, \
                  `otlp_headers_file` its token. The node pushes again by itself"
             }
+            Self::StateNotKept { .. } => {
+                "free space on its disk or mount it to be written, or set `state` in [node] to a directory that can be written; restart the \
+                 node if there was no directory"
+            }
+            Self::AuditNotWritten { .. } => {
+                "free space on its disk or mount it to be written, or name another file with `file` in [audit]. The node tries again by \
+                 itself"
+            }
             Self::RefusedPrograms { .. } => {
                 "the log says who refuses whom where Cyclone DDS does; compare CA, governance and permissions of the two enclaves, and when \
                  both certificates end"
@@ -306,6 +326,12 @@ impl fmt::Display for Alert {
             }
             Self::MetricsNotPushed { to, reason } => {
                 write!(f, "metrics are not pushed to {to}: {reason}")
+            }
+            Self::StateNotKept { reason } => {
+                write!(f, "nothing is kept over a restart, revocation lists included: {reason}")
+            }
+            Self::AuditNotWritten { path, reason } => {
+                write!(f, "the audit log {path} cannot be written, and events are lost from it: {reason}")
             }
             Self::RefusedPrograms { enclave } => write!(
                 f,

@@ -61,11 +61,6 @@ impl LogFile {
         Ok(Self { path: path.to_owned(), room, file, bytes: metadata.len(), is_torn })
     }
 
-    /// Returns its path.
-    pub(super) fn path(&self) -> &Path {
-        &self.path
-    }
-
     /// Appends whole lines. Rotates the file first if they do not fit.
     pub(super) fn append(&mut self, lines: &str) -> io::Result<()> {
         self.follow()?;
