@@ -1,5 +1,5 @@
 # The main targets are `make demo` and `make test`. The others are their parts, or longer tests and benchmarks (`make help`).
-# ARGS goes to the program of a target, such as `sgc demo` or `cargo test`: make demo ARGS="--seconds 10 --json"
+# ARGS goes to the program of a target, such as `sgc demo` or `cargo test`: make demo ARGS="--duration 10s --json"
 
 CARGO ?= cargo
 ARGS ?=
@@ -19,7 +19,7 @@ COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --
 .PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
-	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--seconds 10 --json")'
+	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--duration 10s --json")'
 	@echo 'make test        run the whole suite, as CI does'
 	@echo 'make dist        build the Debian package and the archive of the program in target/dist'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit and interop (ARGS goes to cargo test), helm-lint,'

@@ -39,7 +39,7 @@ use self::stage::{CLOUD, Stage};
 use self::topics::Topic;
 
 /// Longest demo: one week, so that `tracker::SEQ_MAX` is out of reach.
-pub const SECONDS_MAX: i64 = 7 * 86_400;
+pub const SECONDS_MAX: u32 = 7 * 86_400;
 /// Longest time a node may take to start.
 const READY_MAX: Duration = Duration::from_secs(30);
 /// Longest time until the first messages arrive.

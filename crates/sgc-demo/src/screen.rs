@@ -57,7 +57,7 @@ impl Screen {
             "Two ROS 2 networks that cannot see each other, and three sgc processes that join them:\n\n  \
              ROS domain {robot_domain} ─ robot ══ cloud ══ operator ─ ROS domain {operator_domain}\n\n\
              The cloud is a router only: what it passes on is sealed from robot to operator and back.\n\n\
-             If you have ROS 2, join from another terminal (`--seconds 600` leaves more time):\n"
+             If you have ROS 2, join from another terminal (`--duration 600s` leaves more time):\n"
         ))?;
         for (domain, receives) in [(operator_domain, Role::Robot), (robot_domain, Role::Operator)] {
             for topic in Topic::owned_by(receives).filter(|topic| *topic != Topic::Image) {

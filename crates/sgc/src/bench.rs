@@ -10,6 +10,11 @@ use sgc_transport::ListenAddr;
 use sgc_trust::{NodeName, Suite};
 
 use crate::error::CliError;
+use crate::moved::moved;
+use crate::span::parse_seconds;
+
+/// Longest duration of one measurement.
+const SECONDS_MAX: u32 = 60;
 
 /// Measure throughput and latency between two of your machines, through sgc and through the bare network
 ///
@@ -49,7 +54,7 @@ pub(crate) struct AnswerArgs {
 
 /// Measure between this machine and one where `sgc bench answer` runs
 ///
-/// The command prints a table and an interpretation. It takes about twice --seconds for each suite and size. Exit code
+/// The command prints a table and an interpretation. It takes about twice --duration for each suite and size. Exit code
 /// 0 means that it measured; 1 means that it could not, and it prints the cause.
 #[derive(Debug, Args)]
 pub(crate) struct MeasureArgs {
@@ -71,12 +76,17 @@ pub(crate) struct MeasureArgs {
     /// Sizes of messages, separated by commas
     #[arg(long, value_name = "SIZES", value_delimiter = ',', default_value = "16,1000,1MB")]
     sizes: Vec<Size>,
-    /// Duration of each measurement in seconds
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=60))]
-    seconds: u32,
+    /// Duration of each measurement, at most 60s
+    #[arg(long, value_name = "TIME", default_value = "5s",
+          value_parser = |text: &str| parse_seconds(text, SECONDS_MAX))]
+    duration: u32,
+    #[arg(long, value_name = "N", hide = true)]
+    seconds: Option<String>,
     /// File for the figures as JSON
     #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    json_file: Option<PathBuf>,
+    #[arg(long, value_name = "FILE", hide = true)]
+    json: Option<String>,
     /// File for the tables as Markdown
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
@@ -90,9 +100,23 @@ pub(crate) fn bench(args: BenchArgs) -> Result<ExitCode, CliError> {
             sgc_measure::answer(&AnswerOptions { identity, listen, router, echo_port })?;
         }
         BenchCommand::Run(args) => {
-            let MeasureArgs { identity, with, to, router, suites, sizes, seconds, json, markdown } = args;
-            let options =
-                MeasureOptions { identity, with, to, router, suites, sizes, seconds, json, markdown };
+            if let Some(seconds) = args.seconds {
+                return Err(moved(format!("--seconds {seconds}"), format!("--duration {seconds}s")));
+            }
+            if let Some(file) = args.json {
+                return Err(moved(format!("--json {file}"), format!("--json-file {file}")));
+            }
+            let options = MeasureOptions {
+                identity: args.identity,
+                with: args.with,
+                to: args.to,
+                router: args.router,
+                suites: args.suites,
+                sizes: args.sizes,
+                seconds: args.duration,
+                json: args.json_file,
+                markdown: args.markdown,
+            };
             sgc_measure::measure(&options)?;
         }
     }

@@ -8,6 +8,8 @@ use sgc_demo::{DemoOptions, Role, SECONDS_MAX};
 
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::log::start_log;
+use crate::moved::moved;
+use crate::span::parse_seconds;
 
 /// Demonstrate sgc: join two separate ROS 2 networks on this machine by three sgc processes.
 ///
@@ -16,10 +18,12 @@ use crate::log::start_log;
 /// arrived once and unaltered.
 #[derive(Debug, Args)]
 pub(crate) struct DemoArgs {
-    /// How long to count messages, in seconds
-    #[arg(long, value_name = "N", default_value_t = 10,
-          value_parser = clap::value_parser!(u32).range(1..=SECONDS_MAX))]
-    seconds: u32,
+    /// How long to count messages
+    #[arg(long, value_name = "TIME", default_value = "10s",
+          value_parser = |text: &str| parse_seconds(text, SECONDS_MAX))]
+    duration: u32,
+    #[arg(long, value_name = "N", hide = true)]
+    seconds: Option<String>,
     /// Print only one JSON document, at the end
     #[arg(long)]
     json: bool,
@@ -41,7 +45,10 @@ pub(crate) struct PeerArgs {
 
 /// Runs `sgc demo`.
 pub(crate) fn demo(args: DemoArgs) -> Result<ExitCode, CliError> {
-    let DemoArgs { seconds, json, keep } = args;
+    let DemoArgs { duration: seconds, seconds: moved_seconds, json, keep } = args;
+    if let Some(seconds) = moved_seconds {
+        return Err(moved(format!("--seconds {seconds}"), format!("--duration {seconds}s")));
+    }
     let is_sound = sgc_demo::demo(&DemoOptions { seconds, json, keep })?;
     Ok(if is_sound { ExitCode::SUCCESS } else { ExitCode::from(EXIT_FAILURE) })
 }

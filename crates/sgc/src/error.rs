@@ -82,9 +82,9 @@ pub(crate) enum CliError {
     #[error("`{old}` has another name now: {new}")]
     Moved {
         /// The earlier name.
-        old: &'static str,
+        old: String,
         /// The present name.
-        new: &'static str,
+        new: String,
     },
     /// A code with which a machine cannot join.
     #[error("the code: {0}")]
@@ -512,10 +512,10 @@ mod tests {
             usage_line(text, "sgc fleet"),
             "unrecognized subcommand 'flet'; a similar subcommand exists: 'fleet'; see `sgc --help`"
         );
-        let text = "error: invalid value 'x' for '--days <N>': invalid digit\n\nFor more information, try '--help'.\n";
+        let text = "error: invalid value 'x' for '--count <N>': invalid digit\n\nFor more information, try '--help'.\n";
         assert_eq!(
             usage_line(text, "sgc fleet enroll"),
-            "invalid value 'x' for '--days <N>': invalid digit; see `sgc fleet enroll --help`"
+            "invalid value 'x' for '--count <N>': invalid digit; see `sgc fleet enroll --help`"
         );
         let text = "error: the following required arguments were not provided:\n  --owner <NODE>\n\n\
                     Usage: sgc fleet enroll --owner <NODE>\n\nFor more information, try '--help'.\n";

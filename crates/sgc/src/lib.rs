@@ -33,6 +33,7 @@ mod policy;
 mod reload;
 mod run;
 mod service;
+mod span;
 mod status;
 mod supervisor;
 mod token;

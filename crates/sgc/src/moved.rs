@@ -12,6 +12,6 @@ pub(crate) struct MovedArgs {
 }
 
 /// Returns the error that names the new command or option.
-pub(crate) fn moved(old: &'static str, new: &'static str) -> CliError {
-    CliError::Moved { old, new }
+pub(crate) fn moved(old: impl Into<String>, new: impl Into<String>) -> CliError {
+    CliError::Moved { old: old.into(), new: new.into() }
 }

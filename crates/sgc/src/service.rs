@@ -11,12 +11,11 @@ use sgc_node::shell::CallRequest;
 
 use crate::error::CliError;
 use crate::node::NodeArgs;
+use crate::span::parse_span;
 use crate::{output, yaml};
 
 /// Time that the node may take to answer beyond the call itself.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
-/// Default time to wait for a reply, in seconds.
-const TIMEOUT_DEFAULT_S: u64 = 10;
 
 /// Call services here and on the far side, without a ROS 2 installation
 #[derive(Debug, Args)]
@@ -48,8 +47,8 @@ struct CallArgs {
     #[arg(value_name = "REQUEST")]
     second: Option<String>,
     /// Longest time to wait for the reply
-    #[arg(long, value_name = "SECONDS", default_value_t = TIMEOUT_DEFAULT_S)]
-    timeout: u64,
+    #[arg(long, value_name = "TIME", default_value = "10s", value_parser = parse_span)]
+    timeout: Duration,
     #[command(flatten)]
     node: NodeArgs,
 }
@@ -64,10 +63,10 @@ pub(crate) fn service(args: &ServiceArgs) -> Result<ExitCode, CliError> {
         service: args.service.clone(),
         type_name: type_name.map(str::to_owned),
         request,
-        timeout_ms: args.timeout.saturating_mul(1000),
+        timeout_ms: args.timeout.as_secs().saturating_mul(1000),
     };
     let socket = args.node.socket()?;
-    let patience = Duration::from_secs(args.timeout).saturating_add(ANSWER_MAX);
+    let patience = args.timeout.saturating_add(ANSWER_MAX);
     let text = ask(&socket, &AdminRequest::Call(wish), patience)?;
     let reply: Box<RawValue> = answer(&socket, &text)?;
     output::line(reply)?;

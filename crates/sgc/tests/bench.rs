@@ -171,8 +171,8 @@ fn a_run_measures_every_way_and_loses_nothing() {
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0,tcp://127.0.0.1:0"]);
     let urls = answer.said("desk waits at ");
     let (quic, tcp) = urls.split_once(',').unwrap();
-    let args = ["--with", "desk", "--to", quic, "--sizes", "16,1000,100kB", "--seconds", "1"];
-    let files = ["--json", "run.json", "--markdown", "run.md"];
+    let args = ["--with", "desk", "--to", quic, "--sizes", "16,1000,100kB", "--duration", "1s"];
+    let files = ["--json-file", "run.json", "--markdown", "run.md"];
     let output = lab.run("robot.identity", &[&args[..], &files].concat());
     assert!(output.status.success(), "{}", stderr(&output));
     assert_eq!(stderr(&output), "");
@@ -198,8 +198,9 @@ fn a_run_measures_every_way_and_loses_nothing() {
     );
 
     // The side is ready for another run, by another transport and with another suite.
-    let args = ["--with", "desk", "--to", tcp, "--sizes", "16", "--seconds", "1", "--suites", "group-chacha"];
-    let output = lab.run("robot.identity", &[&args[..], &["--json", "run.json"]].concat());
+    let args =
+        ["--with", "desk", "--to", tcp, "--sizes", "16", "--duration", "1s", "--suites", "group-chacha"];
+    let output = lab.run("robot.identity", &[&args[..], &["--json-file", "run.json"]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
     let report: Value = serde_json::from_slice(&fs::read(lab.dir.path().join("run.json")).unwrap()).unwrap();
     check(&report, &["sgc group-chacha"], &["TCP"], &[16]);
@@ -219,8 +220,8 @@ fn through_a_router_all_but_the_bare_path_is_measured() {
     let url = ready["ready"][0].as_str().unwrap();
     let answer = lab.answer(&["--router", url]);
     answer.said("desk waits at ");
-    let args = ["--with", "desk", "--router", url, "--sizes", "16", "--seconds", "1", "--suites", "group"];
-    let output = lab.run("robot.identity", &[&args[..], &["--json", "run.json"]].concat());
+    let args = ["--with", "desk", "--router", url, "--sizes", "16", "--duration", "1s", "--suites", "group"];
+    let output = lab.run("robot.identity", &[&args[..], &["--json-file", "run.json"]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
     let report: Value = serde_json::from_slice(&fs::read(lab.dir.path().join("run.json")).unwrap()).unwrap();
     check(&report, &["sgc group"], &[], &[16]);
@@ -234,7 +235,7 @@ fn another_fleet_is_refused_and_told_so() {
     let lab = Lab::new();
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
     let url = answer.said("desk waits at ");
-    let output = lab.run("stranger.identity", &["--with", "desk", "--to", &url, "--seconds", "1"]);
+    let output = lab.run("stranger.identity", &["--with", "desk", "--to", &url, "--duration", "1s"]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let said = stderr(&output);
     assert!(said.starts_with("sgc: bench: no link to desk\n"), "{said}");
@@ -247,13 +248,13 @@ fn a_wrong_name_or_address_of_the_other_side_is_said_to_be_one() {
     let lab = Lab::new();
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
     let url = answer.said("desk waits at ");
-    let output = lab.run("robot.identity", &["--with", "dask", "--to", &url, "--seconds", "1"]);
+    let output = lab.run("robot.identity", &["--with", "dask", "--to", &url, "--duration", "1s"]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let said = stderr(&output);
     let address = url.strip_prefix("quic://").unwrap();
     assert!(said.starts_with(&format!("sgc: bench: the node at {address} is not dask\n")), "{said}");
     assert!(said.contains("prints the name of its node"), "{said}");
-    let output = lab.run("robot.identity", &["--with", "desk", "--to", address, "--seconds", "1"]);
+    let output = lab.run("robot.identity", &["--with", "desk", "--to", address, "--duration", "1s"]);
     assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
     let said = stderr(&output);
     assert!(said.contains("for '--to <URL>'") && !said.contains("`routers`"), "{said}");
@@ -266,7 +267,7 @@ fn the_end_of_the_other_side_is_told_and_ends_a_run() {
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
     let url = answer.said("desk waits at ");
     let args = ["bench", "run", "--identity", "robot.identity", "--with", "desk", "--to", &url];
-    let mut run = lab.sgc(&[&args[..], &["--seconds", "60", "--sizes", "1000"]].concat());
+    let mut run = lab.sgc(&[&args[..], &["--duration", "60s", "--sizes", "1000"]].concat());
     let run = run.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     answer.said("a run goes on");
     answer.end(Signal::KILL);

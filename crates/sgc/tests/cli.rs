@@ -155,7 +155,7 @@ fn a_fleet_goes_where_it_is_told() {
 fn an_identity_is_what_was_asked_for() {
     let place = Place::new();
     place.good(&["fleet", "create", "lab"]);
-    let said = place.good(&["fleet", "enroll", "arm-1", "--group", "b", "--group", "a", "--days", "3"]);
+    let said = place.good(&["fleet", "enroll", "arm-1", "--group", "b", "--group", "a", "--valid", "3d"]);
     assert!(said.starts_with("arm-1.identity: node arm-1 of fleet lab, in b, a, holds until "), "{said}");
     assert!(said.contains("sgc run --identity arm-1.identity "), "{said}");
     assert_eq!(place.mode("arm-1.identity"), 0o600);
@@ -525,6 +525,7 @@ fn invalid_share_has_no_name() {
 #[test]
 fn usage_errors_are_one_line_and_code_2() {
     let place = Place::new();
+    let bench = ["bench", "run", "--identity", "x", "--with", "desk", "--to", "quic://desk"];
     place.says(2, &["fly"], "unrecognized subcommand 'fly'; see `sgc --help`");
     // Earlier spellings are refused with the present ones, whatever stands behind them.
     for (old, new) in [
@@ -536,6 +537,9 @@ fn usage_errors_are_one_line_and_code_2() {
         (&["token", "revoke", "3f9c"], "sgc token access revoke"),
         (&["policy", "test", "--identity", "desk", "--topic", "/t"], "sgc policy test NODE"),
         (&["fleet", "enroll", "hub", "--router"], "--role router"),
+        (&["demo", "--seconds", "10"], "--duration 10s"),
+        (&[&bench[..], &["--seconds", "5"]].concat(), "--duration 5s"),
+        (&[&bench[..], &["--json", "run.json"]].concat(), "--json-file run.json"),
     ] {
         let said = place.bad(2, old);
         assert!(said.contains("has another name now") && said.trim_end().ends_with(new), "{old:?}: {said}");
@@ -554,8 +558,10 @@ fn usage_errors_are_one_line_and_code_2() {
     );
     for args in [
         &["fleet", "enroll"][..],
-        &["fleet", "enroll", "a", "--days", "0"],
-        &["demo", "--seconds", "0"],
+        &["fleet", "enroll", "a", "--valid", "0d"],
+        &["demo", "--duration", "0s"],
+        &["demo", "--duration", "8d"],
+        &["topic", "echo", "/t", "--timeout", "soon"],
         &["check"],
         &["router", "--identity", "x"],
         &["run", "-c", "node.toml", "--share", "/t"],
@@ -570,6 +576,39 @@ fn usage_errors_are_one_line_and_code_2() {
     let version = place.good(&["--version"]);
     assert!(version.starts_with(concat!("sgc ", env!("CARGO_PKG_VERSION"))), "{version}");
     assert!(!place.good(&["--help"]).contains("demo-peer"));
+}
+
+#[test]
+fn time_without_unit_is_refused_with_its_unit() {
+    let place = Place::new();
+    for args in [
+        &["topic", "echo", "/t", "--timeout", "10"][..],
+        &["topic", "pub", "/t", "--timeout", "10"],
+        &["service", "call", "/s", "--timeout", "10"],
+        &["demo", "--duration", "10"],
+        &["fleet", "status", "--watch=10"],
+        &["fleet", "enroll", "a", "--valid", "10"],
+    ] {
+        let said = place.bad(2, args);
+        assert!(said.contains("a time has a unit: 10s; see `sgc "), "{args:?}: {said}");
+    }
+    // The commands get as far as the node, which does not run.
+    for args in [
+        &["topic", "echo", "/t", "--timeout", "2s"][..],
+        &["topic", "pub", "/t", "{}", "--timeout", "1min"],
+        &["service", "call", "/s", "--timeout", "2s"],
+    ] {
+        assert!(place.bad(1, args).contains("no node of this user runs here"), "{args:?}");
+    }
+}
+
+#[test]
+fn validity_in_days_is_refused_with_its_span() {
+    let place = Place::with_fleet();
+    for verb in ["enroll", "renew"] {
+        let args = ["fleet", verb, "arm-1", "--force", "--days", "30"];
+        place.says(2, &args, "`--days 30` has another name now: --valid 30d");
+    }
 }
 
 #[test]

@@ -146,7 +146,7 @@ fn check_report(report: &Value, seconds_min: f64) {
 
 #[test]
 fn everything_arrives_once_and_unaltered() {
-    let mut demo = Demo::start(&["--seconds", "3", "--json"]);
+    let mut demo = Demo::start(&["--duration", "3s", "--json"]);
     let children = demo.children();
     let (output, tmp) = demo.output();
     assert!(output.status.success(), "{}\n{}", String::from_utf8_lossy(&output.stdout), stderr(&output));
@@ -168,7 +168,7 @@ fn everything_arrives_once_and_unaltered() {
 
 #[test]
 fn a_person_is_told_how_to_join_and_what_came_of_it() {
-    let (output, _) = Demo::start(&["--seconds", "3"]).output();
+    let (output, _) = Demo::start(&["--duration", "3s"]).output();
     let text = String::from_utf8(output.stdout.clone()).unwrap();
     assert!(output.status.success(), "{text}\n{}", stderr(&output));
     assert!(text.contains(" ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST ros2 topic echo /chatter\n"), "{text}");
@@ -180,7 +180,7 @@ fn a_person_is_told_how_to_join_and_what_came_of_it() {
 
 #[test]
 fn killing_it_leaves_no_process() {
-    let mut demo = Demo::start(&["--seconds", "600", "--json"]);
+    let mut demo = Demo::start(&["--duration", "600s", "--json"]);
     let children = demo.children();
     demo.signal(Signal::KILL);
     demo.child.wait().unwrap();
@@ -190,7 +190,7 @@ fn killing_it_leaves_no_process() {
 #[test]
 fn an_interrupt_ends_it_in_good_order() {
     for signal in [Signal::INT, Signal::TERM] {
-        let mut demo = Demo::start(&["--seconds", "600", "--json"]);
+        let mut demo = Demo::start(&["--duration", "600s", "--json"]);
         let children = demo.children();
         // Once the secrets are removed, all nodes are up. The count may or may not have begun.
         eventually("the secrets are gone", || {
@@ -212,7 +212,7 @@ fn an_interrupt_ends_it_in_good_order() {
 
 #[test]
 fn the_death_of_a_process_is_told_and_ends_it() {
-    let mut demo = Demo::start(&["--seconds", "600", "--json"]);
+    let mut demo = Demo::start(&["--duration", "600s", "--json"]);
     let children = demo.children();
     let victim = children.first().unwrap();
     let pid = Pid::from_raw(victim.pid.try_into().unwrap()).unwrap();
@@ -229,7 +229,7 @@ fn the_death_of_a_process_is_told_and_ends_it() {
 
 #[test]
 fn two_demos_at_once_do_not_meet() {
-    let demos = [Demo::start(&["--seconds", "3", "--json"]), Demo::start(&["--seconds", "3", "--json"])];
+    let demos = [Demo::start(&["--duration", "3s", "--json"]), Demo::start(&["--duration", "3s", "--json"])];
     for demo in demos {
         let (output, _) = demo.output();
         let report: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -242,7 +242,7 @@ fn kept_files_can_be_run_again() {
     let place = tempfile::tempdir().unwrap();
     let dir = place.path().join("kept");
     let name = dir.to_str().unwrap();
-    let (output, _) = Demo::start(&["--seconds", "1", "--json", "--keep", name]).output();
+    let (output, _) = Demo::start(&["--duration", "1s", "--json", "--keep", name]).output();
     assert!(output.status.success(), "{}", stderr(&output));
     let mut kept: Vec<_> =
         fs::read_dir(&dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
@@ -280,7 +280,7 @@ fn kept_files_can_be_run_again() {
     }
 
     // Existing files are not overwritten.
-    let (output, _) = Demo::start(&["--seconds", "1", "--keep", name]).output();
+    let (output, _) = Demo::start(&["--duration", "1s", "--keep", name]).output();
     assert_eq!(output.status.code(), Some(2));
     assert_eq!(
         stderr(&output),

@@ -166,7 +166,7 @@ fn messages_are_shown_at_both_ends_and_missing_parts_are_named() {
 
     // Each side has the same messages to show, decoded.
     for (node, side) in [("robot", "local"), ("robot", "sent"), ("desk", "far")] {
-        let args = ["echo", "/chatter", "--json", "-n", "3", "--timeout", "60", "--side", side];
+        let args = ["echo", "/chatter", "--json", "-n", "3", "--timeout", "60s", "--side", side];
         let output = lab.topic(node, &args);
         assert!(output.status.success(), "{node} {side}: {output:?}");
         let lines: Vec<_> = output.stdout.split(|b| *b == b'\n').filter(|line| !line.is_empty()).collect();
@@ -176,7 +176,7 @@ fn messages_are_shown_at_both_ends_and_missing_parts_are_named() {
             assert!(message["data"].as_str().is_some_and(|text| !text.is_empty()), "{message}");
         }
     }
-    let output = lab.topic("desk", &["echo", "/chatter", "--once", "--timeout", "60"]);
+    let output = lab.topic("desk", &["echo", "/chatter", "--once", "--timeout", "60s"]);
     let text = String::from_utf8(output.stdout).unwrap();
     assert!(text.starts_with("data: ") && text.ends_with("---\n"), "{text}");
     let output = lab.topic("desk", &["hz", "/chatter", "-n", "3"]);

@@ -16,10 +16,12 @@ use zeroize::Zeroizing;
 
 use super::remote::{FleetPlace, Remote};
 use super::role::AdmitArgs;
-use super::{DAY, copies, millis, parse_span};
+use super::{copies, millis};
 use crate::error::CliError;
 use crate::files::{self, Existing};
+use crate::moved::moved;
 use crate::output;
+use crate::span::parse_span;
 
 /// Make the identity of a node, in one file.
 ///
@@ -60,10 +62,8 @@ struct OutputArgs {
     /// How long the certificate is valid, such as 90d or 12h [default: 90d]
     #[arg(long, value_name = "TIME", value_parser = parse_span)]
     valid: Option<Duration>,
-    /// Validity in days
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..), hide = true,
-          conflicts_with = "valid")]
-    days: Option<u32>,
+    #[arg(long, value_name = "N", hide = true)]
+    days: Option<String>,
     /// File to write [default: NODE.identity, or NODE.answer with --csr]
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -73,8 +73,11 @@ struct OutputArgs {
 }
 
 impl OutputArgs {
-    fn valid(&self) -> Duration {
-        self.valid.or(self.days.map(|days| DAY * days)).unwrap_or(LEAF_VALIDITY_DEFAULT)
+    fn valid(&self) -> Result<Duration, CliError> {
+        match &self.days {
+            Some(days) => Err(moved(format!("--days {days}"), format!("--valid {days}d"))),
+            None => Ok(self.valid.unwrap_or(LEAF_VALIDITY_DEFAULT)),
+        }
     }
 
     fn path(&self, node: &NodeName, extension: &str) -> PathBuf {
@@ -156,7 +159,7 @@ impl Keeper {
 }
 
 pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
-    let request = args.admit.request(args.again, args.output.valid())?;
+    let request = args.admit.request(args.again, args.output.valid()?)?;
     let mut keeper = Keeper::open(&args.admit.place)?;
     if let Some(csr) = &args.csr {
         let path = args.output.path(&request.node, "answer");
@@ -177,7 +180,7 @@ pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
 pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
     let node: NodeName = args.node.parse()?;
     let mut keeper = Keeper::open(&args.place)?;
-    let valid = args.output.valid();
+    let valid = args.output.valid()?;
     if let Some(csr) = &args.csr {
         let path = args.output.path(&node, "answer");
         args.output.check_free(&path)?;

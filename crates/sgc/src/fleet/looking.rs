@@ -16,10 +16,11 @@ use sgc_process::style::Line;
 use sgc_process::{ProcessError, unix_now};
 use sgc_trust::NodeName;
 
-use super::{WhichFleet, parse_span};
+use super::WhichFleet;
 use crate::error::CliError;
 use crate::node::NodeArgs;
 use crate::output;
+use crate::span::parse_span;
 use crate::why::print_steps;
 
 /// Shortest time between two looks. Nodes give the same report for half a second.

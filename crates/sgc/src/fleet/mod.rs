@@ -21,7 +21,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use sgc_diagnosis::check::FLEET_EXTENSION;
-use sgc_node::{LockedFleet, config};
+use sgc_node::LockedFleet;
 use sgc_process::ProcessError;
 use sgc_trust::Fleet;
 
@@ -30,8 +30,6 @@ pub(crate) use self::looking::members_of_file;
 pub(crate) use self::remote::revoke_by_authority;
 use crate::error::CliError;
 use crate::files;
-
-const DAY: Duration = Duration::from_secs(86_400);
 
 /// Make a fleet, enrol, renew and revoke its nodes, and show how they are doing.
 #[derive(Debug, Args)]
@@ -148,15 +146,6 @@ fn fleet_here(other: Option<&Path>) -> Result<PathBuf, CliError> {
 /// Returns `true` if the path names another directory than this one.
 fn is_elsewhere(path: &Path) -> bool {
     path.parent().is_some_and(|parent| parent != Path::new("") && parent != Path::new("."))
-}
-
-/// Parses how long a certificate is valid: `90d`, `12h`, `30min`.
-fn parse_span(text: &str) -> Result<Duration, String> {
-    match config::parse_duration(text) {
-        Some(Duration::ZERO) => Err("it has to be longer than nothing".into()),
-        Some(span) => Ok(span),
-        None => Err("a time is a number with its unit: 90d, 12h or 30min".into()),
-    }
 }
 
 fn millis(time: Duration) -> u64 {

@@ -14,6 +14,7 @@ use sgc_types::{Definitions, ResolvedType};
 use super::{Tap, TapArgs};
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::output;
+use crate::span::parse_span;
 
 /// Bytes in a line of `--raw`.
 const RAW_LINE_BYTES: usize = 32;
@@ -49,15 +50,15 @@ pub(crate) struct EchoArgs {
     #[arg(long, value_name = "DIR")]
     msg_dir: Vec<PathBuf>,
     /// Fail if no message comes for this time
-    #[arg(long, value_name = "SECONDS")]
-    timeout: Option<u64>,
+    #[arg(long, value_name = "TIME", value_parser = parse_span)]
+    timeout: Option<Duration>,
 }
 
 pub(super) fn echo(args: &EchoArgs) -> Result<ExitCode, CliError> {
     let mut tap = args.tap.begin(u32::MAX)?;
     let layout = if args.raw { None } else { Some(layout(&tap, &args.msg_dir)?) };
     let most = if args.once { Some(1) } else { args.count };
-    let patience = args.timeout.map(Duration::from_secs);
+    let patience = args.timeout;
     let (mut shown, mut dropped) = (0, 0);
     while most.is_none_or(|most| shown < most) {
         let begun = Instant::now();

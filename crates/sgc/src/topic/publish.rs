@@ -16,10 +16,9 @@ use sgc_process::ProcessError;
 use super::{BEGIN_MAX, type_and_message};
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::node::NodeArgs;
+use crate::span::parse_span;
 use crate::{output, yaml};
 
-/// Default time to wait for subscribers, in seconds.
-const WAIT_DEFAULT_S: u64 = 10;
 /// Default time between messages that are given as an argument.
 const PERIOD_DEFAULT: Duration = Duration::from_secs(1);
 /// Longest time between messages.
@@ -68,8 +67,8 @@ pub(crate) struct PubArgs {
     #[arg(short, long, value_name = "N")]
     wait: Option<u32>,
     /// Longest time to wait for subscribers
-    #[arg(long, value_name = "SECONDS", default_value_t = WAIT_DEFAULT_S)]
-    timeout: u64,
+    #[arg(long, value_name = "TIME", default_value = "10s", value_parser = parse_span)]
+    timeout: Duration,
     #[arg(long, value_enum, default_value = "reliable")]
     reliability: ReliabilityArg,
     #[arg(long, value_enum, default_value = "volatile")]
@@ -156,13 +155,15 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
         transient_local: args.durability == DurabilityArg::TransientLocal,
         depth: args.depth,
         wait_for,
-        wait_ms: args.timeout.saturating_mul(1000),
+        wait_ms: args.timeout.as_secs().saturating_mul(1000),
     };
     let (mut publisher, begun) = Publisher::begin(args.node.socket()?, wish)?;
     if begun.subscribers < wait_for {
         output::diagnostic(&format!(
             "sgc: {}: {} subscribers after {} s: nothing was published",
-            args.topic, begun.subscribers, args.timeout
+            args.topic,
+            begun.subscribers,
+            args.timeout.as_secs()
         ));
         return Ok(ExitCode::from(EXIT_FAILURE));
     }
