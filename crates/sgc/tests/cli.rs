@@ -603,6 +603,16 @@ fn time_without_unit_is_refused_with_its_unit() {
 }
 
 #[test]
+fn time_of_watch_is_not_taken_for_a_node() {
+    let place = Place::new();
+    let rule = "a time follows --watch after an equals sign: --watch=1s";
+    place.says(2, &["fleet", "status", "--watch", "1s"], rule);
+    assert!(place.bad(1, &["fleet", "status", "--watch=1s"]).contains("no node of this user runs here"));
+    assert!(place.bad(1, &["fleet", "status", "1s"]).contains("no node of this user runs here"));
+    assert!(place.good(&["fleet", "status", "--help"]).contains("--watch[=<TIME>]"));
+}
+
+#[test]
 fn validity_in_days_is_refused_with_its_span() {
     let place = Place::with_fleet();
     for verb in ["enroll", "renew"] {

@@ -41,7 +41,7 @@ pub(super) struct StatusArgs {
     /// Fleet file with the members; without it, the fleet's authority is asked
     #[arg(long, value_name = "FILE")]
     fleet: Option<PathBuf>,
-    /// Look again every TIME, such as 2s, and show rates; --watch alone looks every 5s
+    /// Look again every TIME, and show rates, as with --watch=2s; --watch alone looks every 5s
     #[arg(long, value_name = "TIME", num_args = 0..=1, require_equals = true, default_missing_value = "5s",
           value_parser = parse_span)]
     watch: Option<Duration>,
@@ -73,6 +73,11 @@ pub(super) struct WhyArgs {
 pub(super) fn status(args: &StatusArgs) -> Result<(), CliError> {
     for name in &args.nodes {
         name.parse::<NodeName>()?;
+        if args.watch.is_some() && parse_span(name).is_ok() {
+            return Err(CliError::Cannot {
+                reason: format!("a time follows --watch after an equals sign: --watch={name}"),
+            });
+        }
     }
     let socket = args.node.socket()?;
     let mut before = None;

@@ -94,7 +94,13 @@ fn argument(arg: &Arg) -> String {
     let names = names.unwrap_or_else(|| vec![arg.get_id().as_str().to_uppercase()]);
     let value = if is_flag { String::new() } else { names.join(" ") };
     let mut forms: Vec<_> = arg.get_short().map(|short| format!("`-{short}`")).into_iter().collect();
-    forms.extend(arg.get_long().map(|long| format!("`{}`", format!("--{long} {value}").trim_end())));
+    let value = match arg.is_require_equals_set() {
+        true if arg.get_num_args().is_some_and(|range| range.min_values() == 0) => format!("[={value}]"),
+        true => format!("={value}"),
+        false if value.is_empty() || arg.is_positional() => value,
+        false => format!(" {value}"),
+    };
+    forms.extend(arg.get_long().map(|long| format!("`--{long}{value}`")));
     if arg.is_positional() {
         forms.push(format!("`{value}`"));
     }
