@@ -19,7 +19,7 @@ use tokio::time::Instant;
 use crate::environment::environment;
 use crate::error::CliError;
 use crate::log::{LogFormat, start_log};
-use crate::{heap, output, supervisor, version};
+use crate::{files, heap, output, supervisor, version};
 
 /// Time after which a node uses no more of what only its start needs. Threads of the start end within it.
 const START_MAX: Duration = Duration::from_secs(10);
@@ -36,7 +36,7 @@ const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 /// signal ends it at once. On SIGHUP it reads its configuration again.
 #[derive(Debug, Args)]
 pub(crate) struct RunArgs {
-    /// Configuration file
+    /// Configuration file; without it and without arguments that describe a node, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE",
           conflicts_with_all = ["identity", "router", "share", "to", "uses", "listen", "announce", "gateway"])]
     config: Option<PathBuf>,
@@ -97,6 +97,22 @@ pub(crate) struct RouterArgs {
     process: ProcessArgs,
 }
 
+impl RunArgs {
+    /// Returns the configuration that `-c` names, or the only one of this directory if the command has no argument
+    /// that describes a node. Returns `None` if arguments describe it.
+    fn config_file(&self) -> Result<Option<PathBuf>, CliError> {
+        let lists = [&self.router, &self.share, &self.to, &self.uses, &self.listen];
+        let is_described = self.identity.is_some()
+            || self.announce
+            || self.gateway
+            || lists.iter().any(|values| !values.is_empty());
+        match is_described {
+            true => Ok(None),
+            false => Ok(Some(files::config_here(self.config.as_deref())?)),
+        }
+    }
+}
+
 /// Arguments of a node's process beside its configuration.
 #[derive(Debug, Args)]
 struct ProcessArgs {
@@ -117,6 +133,7 @@ struct ProcessArgs {
 /// Runs `sgc run`.
 pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
     start_log(args.process.log.as_deref(), args.process.log_format)?;
+    let config = args.config_file()?;
     let is_open = args.to.is_empty() && args.share.iter().any(|share| !share.contains('='));
     let arguments = ArgsConfig {
         identity: args.identity,
@@ -129,9 +146,9 @@ pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
         gateway: args.gateway,
         ..ArgsConfig::default()
     };
-    let what = args.config.as_ref().map_or("command line".to_owned(), |path| path.display().to_string());
-    let file = args.config.clone();
-    let source: ConfigSource = match args.config {
+    let what = config.as_ref().map_or("command line".to_owned(), |path| path.display().to_string());
+    let file = config.clone();
+    let source: ConfigSource = match config {
         Some(path) => Arc::new(move || config::load(&path, &environment)),
         None => Arc::new(move || config::load_args(&arguments, &environment)),
     };

@@ -622,6 +622,20 @@ fn validity_in_days_is_refused_with_its_span() {
 }
 
 #[test]
+fn run_takes_the_only_configuration_here() {
+    let place = Place::with_fleet();
+    place.says(2, &["run"], "no configuration here (no *.toml): name one with -c FILE");
+    place.write("node.toml", "identity = 'absent.identity'\n[node]\nrouters = ['nonsense']\n");
+    let said = place.bad(2, &["run"]);
+    assert!(said.ends_with("sgc: node.toml: 2 mistakes\n"), "{said}");
+    // Arguments that describe a node are not mixed with the configuration.
+    let said = place.bad(2, &["run", "--identity", "arm-1.identity", "--share", "/t"]);
+    assert!(said.contains("sgc: command line: "), "{said}");
+    place.write("other.toml", "");
+    place.says(2, &["run"], "which configuration? Name one with -c: node.toml, other.toml");
+}
+
+#[test]
 fn example_configurations_of_the_package_have_no_mistakes() {
     let place = Place::new();
     place.good(&["fleet", "create", "lab"]);
