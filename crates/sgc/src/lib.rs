@@ -58,7 +58,12 @@ pub use sgc_diagnosis::{COUNTERS, CounterTable, Refusal};
   sgc demo                                  see it work on this machine
   sgc fleet create lab                      make a fleet: lab.fleet
   sgc fleet enroll arm-1                    make a node's identity: arm-1.identity
-  sgc run --identity arm-1.identity --router quic://router.lab.example --share /camera/image --to desk")]
+  sgc run --identity arm-1.identity --router quic://router.lab.example --share /camera/image --to desk
+
+Exit codes:
+  0  success
+  1  a failure while running, or a fault that the command was asked to find
+  2  arguments, a configuration or an identity that cannot be right")]
 struct Cli {
     /// Allow core dumps, and debuggers of the same user. Both can read the node's keys from its memory
     /// [env: SGC_ALLOW_CORE_DUMPS]

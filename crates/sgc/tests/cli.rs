@@ -636,6 +636,15 @@ fn run_takes_the_only_configuration_here() {
 }
 
 #[test]
+fn help_and_man_page_list_the_exit_codes() {
+    let place = Place::new();
+    let code = "2  arguments, a configuration or an identity that cannot be right";
+    assert!(place.good(&["--help"]).contains(code));
+    place.good(&["man", "."]);
+    assert!(place.read("sgc.1").contains(code));
+}
+
+#[test]
 fn example_configurations_of_the_package_have_no_mistakes() {
     let place = Place::new();
     place.good(&["fleet", "create", "lab"]);
