@@ -48,6 +48,9 @@ pub(crate) struct NameArgs {
     /// `unique` of the share
     #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
     unique: String,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// Runs `sgc name`.
@@ -59,7 +62,11 @@ pub(crate) fn name(args: &NameArgs) -> Result<(), CliError> {
         return Err(CliError::Cannot { reason });
     }
     let identity = sgc_node::load_identity(&args.identity)?;
-    output::line(name_of(&identity, &args.identity, &owner, &share)?)
+    let name = name_of(&identity, &args.identity, &owner, &share)?;
+    if args.json {
+        return output::json(&serde_json::json!({ "name": name.to_string() }));
+    }
+    output::line(name)
 }
 
 impl NameArgs {
@@ -116,6 +123,7 @@ mod tests {
             interface: String::new(),
             description: description.into(),
             unique: String::new(),
+            json: false,
         }
     }
 

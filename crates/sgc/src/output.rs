@@ -4,9 +4,17 @@ use std::fmt::Display;
 
 pub(crate) use sgc_process::output::{bytes, clean, columns, diagnostic, raw};
 
+use serde::Serialize;
+use sgc_process::ProcessError;
+
 use crate::error::CliError;
 
 /// Writes a line of the result.
 pub(crate) fn line(text: impl Display) -> Result<(), CliError> {
     Ok(sgc_process::output::line(text)?)
+}
+
+/// Writes a result as JSON on one line.
+pub(crate) fn json(value: &impl Serialize) -> Result<(), CliError> {
+    line(serde_json::to_string(value).map_err(|error| ProcessError::Output(error.into()))?)
 }

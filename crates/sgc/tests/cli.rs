@@ -613,6 +613,28 @@ fn time_of_watch_is_not_taken_for_a_node() {
 }
 
 #[test]
+fn name_ca_and_access_token_are_printed_as_json() {
+    let place = Place::with_fleet();
+    place
+        .write("node.toml", "identity = 'arm-1.identity'\n[node]\nrouters = ['quic://r']\nstate = 'state'\n");
+    let name = [&NAME_ARGS[..], &["--owner", "arm-1"]].concat();
+    let parsed = |text: &str| serde_json::from_str::<Value>(text).expect(text);
+    let json = parsed(&place.good(&[&name[..], &["--json"]].concat()));
+    assert_eq!(json["name"], place.good(&name).trim_end());
+    let json = parsed(&place.good(&["fleet", "ca", "--json"]));
+    assert_eq!(
+        (&json["fleet"], &json["certificate"]),
+        (&"lab".into(), &place.good(&["fleet", "ca"]).trim_end().into())
+    );
+    let ran = place.run(&["token", "access", "create", "--for", "x", "--subscribe", "/t", "--json"]);
+    let json = parsed(&ran.stdout);
+    assert_eq!((ran.code, &json["for"]), (Some(0), &"x".into()), "{}", ran.stderr);
+    let listed = parsed(&place.good(&["token", "access", "list", "--json"]));
+    assert_eq!(listed[0]["id"], json["id"]);
+    assert!(json["token"].as_str().is_some_and(|token| !token.is_empty()));
+}
+
+#[test]
 fn validity_in_days_is_refused_with_its_span() {
     let place = Place::with_fleet();
     for verb in ["enroll", "renew"] {

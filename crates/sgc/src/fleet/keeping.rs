@@ -40,6 +40,9 @@ pub(super) struct ListArgs {
 pub(super) struct CaArgs {
     #[command(flatten)]
     which: WhichFleet,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// Revoke all certificates of nodes, for good.
@@ -153,6 +156,11 @@ pub(super) fn list(args: &ListArgs) -> Result<(), CliError> {
 pub(super) fn ca(args: &CaArgs) -> Result<(), CliError> {
     let (_, fleet) = args.which.read()?;
     let text = pem_text("CERTIFICATE", fleet.ca_certificate());
+    if args.json {
+        return output::json(
+            &serde_json::json!({ "fleet": fleet.name().as_str(), "certificate": text.trim_end() }),
+        );
+    }
     output::line(text.trim_end())
 }
 

@@ -74,6 +74,9 @@ struct CreateArgs {
     /// Write the token into this file, mode 0600, instead of printing it
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Print the token, its id and its end as JSON
+    #[arg(long, conflicts_with = "out")]
+    json: bool,
 }
 
 /// List the tokens that have not expired.
@@ -157,6 +160,10 @@ fn create(args: &CreateArgs) -> Result<(), CliError> {
             let text = zeroize::Zeroizing::new(format!("{}\n", token.to_text().as_str()));
             Ok(files::write_secret(path, &text, files::Existing::Keep(""))?)
         }
+        None if args.json => output::json(&serde_json::json!({
+            "id": grant.id.to_string(), "for": grant.label, "expires": grant.expires.to_string(),
+            "token": token.to_text().as_str(),
+        })),
         None => output::line(token.to_text().as_str()),
     }
 }
@@ -179,9 +186,7 @@ fn list(args: &ListArgs) -> Result<(), CliError> {
     let mut records = AccessRecords::load(&state)?;
     records.tokens.retain(|record| record.expires >= now.0);
     if args.json {
-        let text =
-            serde_json::to_string(&records.tokens).map_err(|error| ProcessError::Output(error.into()))?;
-        return output::line(text);
+        return output::json(&records.tokens);
     }
     if records.tokens.is_empty() {
         return output::line("no access token was made here that has not ended");
