@@ -353,15 +353,19 @@ async fn keep_accepting(
 ) {
     // The set ends all connections when the listener ends.
     let mut connections = JoinSet::new();
+    let mut is_failing = false;
     loop {
         tokio::select! {
             accepted = listener.accept() => match accepted {
                 Ok((stream, peer)) => {
+                    is_failing = false;
                     let _ = stream.set_nodelay(true);
                     connections.spawn(serve(stream, peer, at, Arc::clone(&shared), open.clone()));
                 }
                 Err(error) => {
-                    tracing::warn!(%error, "the gateway could not accept a connection");
+                    if !std::mem::replace(&mut is_failing, true) {
+                        tracing::warn!(%error, "the gateway cannot accept connections; it tries again");
+                    }
                     tokio::time::sleep(ACCEPT_RETRY).await;
                 }
             },

@@ -9,7 +9,7 @@ use serde::Serialize;
 use sgc_gateway::ShownCertificate;
 use sgc_node::config::Config;
 use sgc_node::{GatewayCertificate, gateway_urls};
-use sgc_process::{ProcessError, unix_now};
+use sgc_process::unix_now;
 use sgc_trust::{Identity, pem_text};
 use sgc_wire::UnixMillis;
 
@@ -81,8 +81,7 @@ fn certificate(args: &CertificateArgs) -> Result<(), CliError> {
     }
     if args.json {
         let answer = Answer { urls: reach.urls, shown, own: certificate.is_own, pem };
-        let text = serde_json::to_string(&answer).map_err(|error| ProcessError::Output(error.into()))?;
-        return output::line(text);
+        return output::json(&answer);
     }
     let mut rows: Vec<_> = reach.urls.iter().map(|url| vec!["url".to_owned(), url.clone()]).collect();
     rows.push(vec!["pin".to_owned(), shown.pin]);

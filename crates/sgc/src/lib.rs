@@ -15,6 +15,7 @@ mod bench;
 mod check;
 mod dashboard;
 mod demo;
+mod descriptors;
 mod environment;
 mod error;
 mod files;

@@ -11,7 +11,7 @@ use sgc_diagnosis::DiagnosisError;
 use sgc_node::config::{self, Config};
 use sgc_node::partners::Partners;
 use sgc_node::policy::{Subject, Verdict, explain};
-use sgc_process::{ProcessError, unix_now};
+use sgc_process::unix_now;
 use sgc_trust::{GroupName, Identity, NodeName};
 use sgc_wire::Role;
 
@@ -127,8 +127,7 @@ fn test(args: &TestArgs) -> Result<ExitCode, CliError> {
         who,
     };
     if args.json {
-        let text = serde_json::to_string(&answer).map_err(|error| ProcessError::Output(error.into()))?;
-        output::line(text)?;
+        output::json(&answer)?;
     } else {
         let (yes, not) = if answer.permitted { ("yes", "") } else { ("no", " not") };
         output::line(format!("{yes}: {} may{not} {word} {}: {}", answer.who, answer.topic, answer.because))?;

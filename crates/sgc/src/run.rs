@@ -19,7 +19,7 @@ use tokio::time::Instant;
 use crate::environment::environment;
 use crate::error::CliError;
 use crate::log::{LogFormat, start_log};
-use crate::{files, heap, output, supervisor, version};
+use crate::{descriptors, files, heap, output, supervisor, version};
 
 /// Time after which a node uses no more of what only its start needs. Threads of the start end within it.
 const START_MAX: Duration = Duration::from_secs(10);
@@ -212,6 +212,7 @@ fn run_node(
 ) -> Result<(), CliError> {
     let config = source().map_err(|errors| CliError::Config { what, errors })?;
     heap::share_arenas();
+    descriptors::allow_all();
     let stdin_closed = process.until_stdin_closes.then(stdin_closed);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()

@@ -367,3 +367,15 @@ fn node_that_starts_before_its_host_has_an_address_links_once_it_has_one() {
     network.ip(&["address", "add", "10.77.0.1/24", "dev", "lo"]).unwrap();
     place.assert_mended();
 }
+
+#[test]
+fn node_takes_all_the_open_files_that_it_may_have() {
+    let place = Place::new("files");
+    place.enroll();
+    let _cloud = place.start_cloud();
+    let desk = place.start_desk_on("ulimit -Sn 64", "state = \"desk.state\"");
+    let limits = fs::read_to_string(format!("/proc/{}/limits", desk.pid())).unwrap();
+    let open_files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
+    let [soft, hard] = [3, 4].map(|column| open_files.split_whitespace().nth(column));
+    assert!(soft == hard && soft != Some("64"), "{open_files}");
+}

@@ -12,7 +12,7 @@ use sgc_diagnosis::DiagnosisError;
 use sgc_node::config::{self, Config, Interface, RouterUrl, ShareConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords, read_ca_file};
 use sgc_node::policy::metadata;
-use sgc_process::{ProcessError, unix_now};
+use sgc_process::unix_now;
 use sgc_transport::LinkUrl;
 use sgc_trust::{FleetSecret, Identity, ShareToken, TOKEN_ROUTERS_MAX, TopicSecret, TrustAnchors, pem_text};
 use sgc_wire::{NodeId, UnixMillis};
@@ -320,8 +320,7 @@ fn list(state: &Path, json: bool) -> Result<(), CliError> {
     let in_force: Vec<_> = records.tokens.iter().filter(|record| record.expires > now.0).collect();
     if json {
         let rows: Vec<_> = in_force.iter().map(|record| RecordJson::new(record)).collect();
-        let text = serde_json::to_string(&rows).map_err(|error| ProcessError::Output(error.into()))?;
-        return output::line(text);
+        return output::json(&rows);
     }
     if in_force.is_empty() {
         return output::line("no token is in force");
