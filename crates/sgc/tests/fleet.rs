@@ -438,7 +438,7 @@ fn renewal_keeps_key_and_place() {
     );
     assert!(place.bad(&["fleet", "renew", "nobody"]).contains("has no node nobody"));
     for (time, said) in
-        [("0d", "longer than nothing"), ("5", "a number with its unit"), ("xd", "90d, 12h or 30min")]
+        [("0d", "longer than nothing"), ("5", "a time has a unit"), ("xd", "90d, 12h, 30min or 2s")]
     {
         assert!(place.bad(&["fleet", "renew", "arm-1", "--valid", time]).contains(said));
     }
