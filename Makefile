@@ -93,19 +93,11 @@ ros-package:
 	@[ -x "$${CARGO_TARGET_DIR:-target}/debug/sgc" ] || $(CARGO) build --locked -p sgc $(FEATURES)
 	scripts/ros-package.sh "$${CARGO_TARGET_DIR:-target}/debug/sgc"
 
-# In sequence even with -j, the quick ones first.
+# In sequence even with -j, the quick ones first. Each says how long it took.
 test: deps-test
-	$(MAKE) fmt
-	$(MAKE) deny
-	$(MAKE) peers
-	$(MAKE) vectors
-	$(MAKE) clippy
-	$(MAKE) peers-check
-	$(MAKE) unit
-	$(MAKE) interop
-	$(MAKE) helm-lint
-	$(MAKE) ros-package
-	$(MAKE) docs
+	@set -e; for part in fmt deny peers vectors clippy peers-check unit interop helm-lint ros-package docs; do \
+		begin=$$(date +%s); $(MAKE) $$part; echo "== $$part took $$(($$(date +%s) - begin)) s"; \
+	done
 
 deps-build:
 	@scripts/install-deps.sh build
