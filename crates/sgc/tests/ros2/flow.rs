@@ -37,10 +37,12 @@ fn start(
     (talker, listener)
 }
 
-/// Runs a publisher and a subscriber ([`start`]). Returns the subscriber's summary once it has the last message.
+/// Runs a publisher and a subscriber ([`start`]). Returns the subscriber's summary once it has the last message. The
+/// publisher stays until then.
 fn carry(lab: &Lab, pair: [&str; 2], sites: [Site; 2], messages: u64, extra: &[&str]) -> Value {
-    let (mut talker, mut listener) = start(lab, pair, sites, messages, "1", extra);
+    let (mut talker, mut listener) = start(lab, pair, sites, messages, PLAN.peer_life, extra);
     let summary = listener.summary();
+    talker.end();
     talker.summary();
     summary
 }
