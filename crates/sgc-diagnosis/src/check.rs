@@ -6,12 +6,12 @@
 use std::path::Path;
 
 use sgc_gateway::Anonymous;
+use sgc_node::UnknownMember;
 use sgc_node::alerts::{Alert, clock_alert};
 use sgc_node::config::{
     Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig, TokenSource,
 };
 use sgc_node::discovery_server;
-use sgc_node::{StateError, UnknownMember};
 use sgc_process::files;
 use sgc_process::unix_now;
 use sgc_trust::Identity;
@@ -175,9 +175,8 @@ pub fn summary(
     let state = sgc_node::state_dir(config, identity.node_name().as_str());
     if let Some(Err(error)) = state.as_deref().map(sgc_node::check_state_dir) {
         rows.push(vec![WARNING.to_owned(), format!("{error}; the node does not start like that")]);
-    } else if let Some((source, path)) = state.and_then(|dir| Some((sgc_node::storage_fault(&dir)?, dir))) {
-        let reason = StateError::Directory { path, source }.to_string();
-        let alert = Alert::StateNotKept { reason };
+    } else if let Some(error) = state.as_deref().and_then(sgc_node::storage_fault) {
+        let alert = Alert::StateNotKept { reason: error.to_string() };
         rows.push(vec![WARNING.to_owned(), format!("{alert}: {}", alert.fix())]);
     }
     Ok(rows)

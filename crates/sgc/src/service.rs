@@ -11,7 +11,7 @@ use sgc_node::shell::CallRequest;
 
 use crate::error::CliError;
 use crate::node::NodeArgs;
-use crate::span::parse_span;
+use crate::span::{millis, parse_span};
 use crate::{output, yaml};
 
 /// Time that the node may take to answer beyond the call itself.
@@ -63,7 +63,7 @@ pub(crate) fn service(args: &ServiceArgs) -> Result<ExitCode, CliError> {
         service: args.service.clone(),
         type_name: type_name.map(str::to_owned),
         request,
-        timeout_ms: args.timeout.as_secs().saturating_mul(1000),
+        timeout_ms: millis(args.timeout),
     };
     let socket = args.node.socket()?;
     let patience = args.timeout.saturating_add(ANSWER_MAX);

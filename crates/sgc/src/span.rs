@@ -20,6 +20,11 @@ pub(crate) fn parse_seconds(text: &str, max: u32) -> Result<u32, String> {
     seconds.ok_or_else(|| format!("at most {max}s"))
 }
 
+/// Returns a span in milliseconds, or as many as there can be.
+pub(crate) fn millis(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
+}
+
 fn is_number(text: &str) -> bool {
     !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit())
 }

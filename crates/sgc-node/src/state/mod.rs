@@ -162,11 +162,12 @@ pub(crate) fn is_storage_fault(error: &io::Error) -> bool {
 }
 
 /// Writes a file into the directory and removes it. Returns the error if the disk is full or read-only.
-pub fn storage_fault(dir: &Path) -> Option<io::Error> {
+pub fn storage_fault(dir: &Path) -> Option<StateError> {
     let probe = dir.join(PROBE_FILE);
     let written = replace(&probe, b"probe");
     let _ = fs::remove_file(&probe);
-    written.err().filter(is_storage_fault)
+    let source = written.err().filter(is_storage_fault)?;
+    Some(StateError::Directory { path: dir.to_owned(), source })
 }
 
 /// Reads a file of at most `max` bytes that is no symbolic link; `None` if it is missing.

@@ -2,7 +2,7 @@
 //!
 //! Writers report their own errors to the log. This module only decides whether the operator is alerted.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -32,26 +32,21 @@ impl StateStorage {
         match create_state_dir(&dir) {
             Ok(()) => Ok(match storage_fault(&dir) {
                 None => Self { dir: Some(dir), ..Self::default() },
-                Some(source) => {
-                    Self::faulty(Some(&dir), &StateError::Directory { path: dir.clone(), source })
-                }
+                Some(error) => Self::faulty(Some(dir), &error),
             }),
-            Err(error @ StateError::Directory { .. }) if config.state.is_none() => {
-                Ok(Self::faulty(None, &error))
+            Err(StateError::Directory { path, source })
+                if config.state.is_none() || is_storage_fault(&source) =>
+            {
+                Ok(Self::faulty(None, &StateError::Directory { path, source }))
             }
-            Err(error) => match &error {
-                StateError::Directory { source, .. } if is_storage_fault(source) => {
-                    Ok(Self::faulty(None, &error))
-                }
-                _ => Err(error),
-            },
+            Err(error) => Err(error),
         }
     }
 
-    fn faulty(dir: Option<&Path>, error: &StateError) -> Self {
+    fn faulty(dir: Option<PathBuf>, error: &StateError) -> Self {
         let reason = error.to_string();
         warn!("nothing is kept over a restart: {reason}");
-        Self { dir: dir.map(Path::to_owned), fault: Arc::new(Mutex::new(Some(reason))) }
+        Self { dir, fault: Arc::new(Mutex::new(Some(reason))) }
     }
 
     /// Returns an alert while nothing can be written.

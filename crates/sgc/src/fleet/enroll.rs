@@ -14,14 +14,14 @@ use sgc_trust::{
 use sgc_wire::{Operation, UnixMillis};
 use zeroize::Zeroizing;
 
+use super::copies;
 use super::remote::{FleetPlace, Remote};
 use super::role::AdmitArgs;
-use super::{copies, millis};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::moved::moved;
 use crate::output;
-use crate::span::parse_span;
+use crate::span::{millis, parse_span};
 
 /// Make the identity of a node, in one file.
 ///

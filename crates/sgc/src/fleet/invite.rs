@@ -11,10 +11,9 @@ use sgc_process::system_rng;
 use sgc_trust::{INVITATION_ROUTERS_MAX, Invitation, LEAF_VALIDITY_DEFAULT};
 use sgc_wire::Operation;
 
-use super::millis;
 use super::role::AdmitArgs;
 use crate::error::CliError;
-use crate::span::parse_span;
+use crate::span::{millis, parse_span};
 use crate::{node, output};
 
 const WITHIN_DEFAULT: Duration = Duration::from_secs(15 * 60);

@@ -27,14 +27,13 @@ use tokio::runtime::Runtime;
 use tokio::sync::oneshot;
 use zeroize::Zeroizing;
 
-use super::millis;
 use super::remote::Remote;
 use crate::environment::environment;
 use crate::error::CliError;
 use crate::files::{self, Existing, PUBLIC_MODE, PendingFile, SECRET_MODE};
 use crate::name::toml_string;
 use crate::output;
-use crate::span::parse_span;
+use crate::span::{millis, parse_span};
 
 /// Time for which a router is looked for.
 const WAIT_DEFAULT: Duration = Duration::from_secs(60);

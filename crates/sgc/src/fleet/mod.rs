@@ -17,7 +17,6 @@ mod role;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use sgc_diagnosis::check::FLEET_EXTENSION;
@@ -146,10 +145,6 @@ fn fleet_here(other: Option<&Path>) -> Result<PathBuf, CliError> {
 /// Returns `true` if the path names another directory than this one.
 fn is_elsewhere(path: &Path) -> bool {
     path.parent().is_some_and(|parent| parent != Path::new("") && parent != Path::new("."))
-}
-
-fn millis(time: Duration) -> u64 {
-    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
 /// Returns the `--fleet FILE` that a hint has to repeat, or nothing if the fleet is found without it.

@@ -16,7 +16,7 @@ use sgc_process::ProcessError;
 use super::{BEGIN_MAX, type_and_message};
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::node::NodeArgs;
-use crate::span::parse_span;
+use crate::span::{millis, parse_span};
 use crate::{output, yaml};
 
 /// Default time between messages that are given as an argument.
@@ -155,7 +155,7 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
         transient_local: args.durability == DurabilityArg::TransientLocal,
         depth: args.depth,
         wait_for,
-        wait_ms: args.timeout.as_secs().saturating_mul(1000),
+        wait_ms: millis(args.timeout),
     };
     let (mut publisher, begun) = Publisher::begin(args.node.socket()?, wish)?;
     if begun.subscribers < wait_for {
