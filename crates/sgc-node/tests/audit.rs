@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::Write;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -27,7 +28,7 @@ impl Place {
 
     /// Writes records through a log that is opened and finished.
     fn write(&self, room: AuditRoom, records: impl IntoIterator<Item = AuditRecord>) {
-        let names = PeerNames::from([(NodeId([7; 32]), "desk".to_owned())]);
+        let names = PeerNames::from(BTreeMap::from([(NodeId([7; 32]), "desk".to_owned())]));
         let (audit, writer) = Audit::open(&self.path(), room, names).unwrap();
         records.into_iter().for_each(|record| audit.write(record));
         writer.finish();
@@ -87,7 +88,7 @@ fn a_record_from_beside_comes_between_those_of_the_node_that_runs() {
     let place = Place::new();
     let made = AuditRecord::new(AuditEvent::TokenMade).by("uid 1000");
     audit::append(&place.path(), &made).unwrap();
-    let (log, writer) = Audit::open(&place.path(), ROOM, PeerNames::new()).unwrap();
+    let (log, writer) = Audit::open(&place.path(), ROOM, PeerNames::default()).unwrap();
     audit::append(&place.path(), &AuditRecord::new(AuditEvent::TokenRevoked)).unwrap();
     log.write(granted(7));
     writer.finish();
@@ -139,7 +140,7 @@ fn a_member_that_joins_and_leaves_for_ever_pushes_out_nothing() {
 #[test]
 fn summarised_audit_records_are_counted_in_the_status() {
     let place = Place::new();
-    let (log, writer) = Audit::open(&place.path(), ROOM, PeerNames::new()).unwrap();
+    let (log, writer) = Audit::open(&place.path(), ROOM, PeerNames::default()).unwrap();
     crowd(2, &[AuditEvent::Left], 100).for_each(|record| log.write(record));
     assert_eq!((log.summed_up_total(), log.lost_total()), (184, 0));
     writer.finish();
@@ -194,7 +195,7 @@ fn a_full_log_is_put_aside_and_as_many_kept_as_are_asked_for() {
 #[test]
 fn a_log_that_another_program_renames_cuts_or_removes_goes_on_at_its_place() {
     let place = Place::new();
-    let (log, writer) = Audit::open(&place.path(), ROOM, PeerNames::new()).unwrap();
+    let (log, writer) = Audit::open(&place.path(), ROOM, PeerNames::default()).unwrap();
     let peers = |path: &Path| fs::read_to_string(path).unwrap_or_default().matches("\"peer\"").count();
     let write = |peer| {
         log.write(granted(peer));
@@ -258,7 +259,7 @@ fn a_line_that_a_killed_run_left_is_ended_and_counted() {
 #[test]
 fn lost_audit_records_are_reported() {
     let place = Place::new();
-    let (audit, writer) = Audit::open(&place.path(), ROOM, PeerNames::new()).unwrap();
+    let (audit, writer) = Audit::open(&place.path(), ROOM, PeerNames::default()).unwrap();
     // More records than the queue holds, faster than a disk. All that do not fit must be accounted for.
     const N: u64 = 50_000;
     (0..N).for_each(|_| audit.write(AuditRecord::new(AuditEvent::Reload)));
@@ -278,9 +279,9 @@ fn a_log_is_not_written_through_a_link_nor_into_what_is_no_file() {
     let target = place.dir.path().join("target");
     fs::write(&target, "kept").unwrap();
     symlink(&target, place.path()).unwrap();
-    assert!(Audit::open(&place.path(), ROOM, PeerNames::new()).is_err());
+    assert!(Audit::open(&place.path(), ROOM, PeerNames::default()).is_err());
     assert_eq!(fs::read_to_string(&target).unwrap(), "kept");
-    assert!(Audit::open(place.dir.path(), ROOM, PeerNames::new()).is_err());
+    assert!(Audit::open(place.dir.path(), ROOM, PeerNames::default()).is_err());
     fs::remove_file(place.path()).unwrap();
     assert!(audit::read(&place.path(), |_| {}).is_err(), "there is none");
     // A log that is switched off accepts everything and keeps nothing.

@@ -72,7 +72,7 @@ use crate::gateway::Gateway;
 use crate::local::network_slot::NetworkSlot;
 use crate::local::network_state::NetworkState;
 use crate::metrics::Metrics;
-use crate::state::audit::Audit;
+use crate::state::audit::{Audit, PeerNames};
 use crate::state::credentials::StateWriter;
 use crate::state::storage::StateStorage;
 
@@ -132,6 +132,7 @@ pub(crate) struct Core<N: RosNetwork> {
     audit: Audit,
     storage: StateStorage,
     board: Board,
+    names: PeerNames,
     refused: Refusals,
     /// Taps of the local network.
     local_taps: Vec<Arc<TapQueue>>,
@@ -181,6 +182,8 @@ pub(crate) struct CoreParts<N> {
     pub audit: Audit,
     pub storage: StateStorage,
     /// State of the searches for routers.
+    /// The names of other nodes.
+    pub names: PeerNames,
     pub(crate) board: Board,
     /// Keep-alive policy of new links.
     pub(crate) keep_alive_policy: KeepAlivePolicy,
@@ -222,7 +225,7 @@ impl<N: RosNetwork> Core<N> {
             network: parts.network,
             data: data.clone(),
             inbox: Inbox::default(),
-            links: LinkTable::new(parts.keep_alive_policy, data.clone()),
+            links: LinkTable::new(parts.keep_alive_policy, parts.names.clone(), data.clone()),
             forwards: ForwardTable::default(),
             shares,
             ends: NetworkEnds::default(),
@@ -253,6 +256,7 @@ impl<N: RosNetwork> Core<N> {
             storage: parts.storage,
             board: parts.board,
             refused: Refusals::default(),
+            names: parts.names,
             types: InterfaceTypes::new(parts.types, parts.definitions),
             members,
             local_taps: Vec::new(),

@@ -1,7 +1,6 @@
 //! Counters of the data path, and reasons of drops.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt::{self, Display};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Mutex, MutexGuard};
 
@@ -10,6 +9,7 @@ use sgc_sync::lock;
 use sgc_wire::{Name, NodeId};
 
 use crate::drops::DropKind;
+use crate::state::audit::PeerNames;
 
 /// Traffic of one name at this node.
 #[derive(Debug, Default)]
@@ -194,15 +194,6 @@ impl From<NodeId> for Culprit {
     }
 }
 
-impl Display for Culprit {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Link(link) => link.fmt(f),
-            Self::Peer(peer) => f.write_str(&peer.short()),
-        }
-    }
-}
-
 /// Counts by kind, and by kind and culprit. They are written on the rare path only. The count of a kind includes all
 /// its culprits, also of links that have ended.
 #[derive(Debug, Default)]
@@ -268,12 +259,24 @@ impl Drops {
         counts.rows.retain(|(culprit, _), _| *culprit != Culprit::Link(link));
     }
 
-    /// Returns all counts.
+    /// Returns all counts. Peers are called by the beginning of their ids.
     pub(crate) fn snapshot(&self) -> BTreeMap<String, u64> {
+        self.snapshot_by_name(&PeerNames::default())
+    }
+
+    /// Returns all counts. Peers are called by their names.
+    pub(crate) fn snapshot_by_name(&self, names: &PeerNames) -> BTreeMap<String, u64> {
         let counts = self.lock();
-        let kinds = counts.kinds.iter().map(|(kind, n)| ((*kind).to_owned(), *n));
-        let rows = counts.rows.iter().map(|((culprit, kind), n)| (format!("{kind} from {culprit}"), *n));
-        kinds.chain(rows).collect()
+        let mut all: BTreeMap<_, _> = counts.kinds.iter().map(|(kind, n)| ((*kind).to_owned(), *n)).collect();
+        for ((culprit, kind), n) in &counts.rows {
+            let culprit = match culprit {
+                Culprit::Link(link) => link.to_string(),
+                Culprit::Peer(peer) => names.called(peer),
+            };
+            // Two peers may have one name.
+            *all.entry(format!("{kind} from {culprit}")).or_default() += n;
+        }
+        all
     }
 
     fn lock(&self) -> MutexGuard<'_, Counts> {
@@ -342,5 +345,7 @@ mod tests {
         let row = |key: &str, n| (key.to_owned(), n);
         let peer = format!("stale from {}", NodeId([7; 32]).short());
         assert_eq!(rows, [row("stale", 4), row(&peer, 1), row("stale from link 2", 1)]);
+        let names = PeerNames::from(BTreeMap::from([(NodeId([7; 32]), "arm".to_owned())]));
+        assert_eq!(drops.snapshot_by_name(&names)["stale from arm"], 1);
     }
 }

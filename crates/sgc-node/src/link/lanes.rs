@@ -24,6 +24,7 @@ use tokio::time::{sleep, timeout};
 use tracing::{debug, info, warn};
 
 use crate::control::peers::control_queue::ControlQueue;
+use crate::state::audit::PeerNames;
 
 /// Most lanes of one link.
 pub(crate) const LANES_MAX: usize = 8;
@@ -44,6 +45,7 @@ const REFUSED_MAX: Duration = Duration::from_secs(600);
 #[derive(Clone, Default)]
 pub(crate) struct LaneAdmission {
     expected: Arc<Mutex<BTreeMap<LaneToken, ExpectedLane>>>,
+    names: PeerNames,
 }
 
 /// A lane that was agreed on.
@@ -55,6 +57,11 @@ struct ExpectedLane {
 }
 
 impl LaneAdmission {
+    /// Creates an admission that expects no lane.
+    pub(crate) fn new(names: PeerNames) -> Self {
+        Self { expected: Arc::default(), names }
+    }
+
     /// Expects a lane. Returns `false` if too many are expected.
     fn expect(&self, token: LaneToken, name: Name, lanes: &Arc<Lanes>) -> bool {
         let now = Instant::now();
@@ -83,7 +90,8 @@ impl LaneAdmission {
         match found.and_then(|e| Some((e.lanes.upgrade()?, e.name))) {
             Some((lanes, name)) => lanes.attach(name, lane),
             None => {
-                warn!(remote = %lane.remote(), peer = %lane.peer().node_id.short(), "closed an unexpected lane");
+                let peer = self.names.called(&lane.peer().node_id);
+                warn!(remote = %lane.remote(), peer, "closed an unexpected lane");
                 lane.close(CloseReason::Denied("no such lane was agreed on".into()));
             }
         }

@@ -40,7 +40,7 @@ use crate::metrics::Metrics;
 use crate::node::error::NodeError;
 use crate::node::local::{OpenNetwork, local_routes, open_again};
 use crate::node::random::system_rng;
-use crate::state::audit::{self, Audit, AuditWriter};
+use crate::state::audit::{self, Audit, AuditWriter, PeerNames};
 use crate::state::credentials::{StateWriter, with_kept_crls};
 use crate::state::run_lock::RunLock;
 use crate::state::storage::StateStorage;
@@ -68,6 +68,7 @@ pub(super) struct BuiltNode<N: RosNetwork> {
     pub(super) state: Option<PathBuf>,
     pub(super) run_lock: RunLock,
     pub(super) audit: Audit,
+    pub(super) names: PeerNames,
     pub(super) audit_writer: Option<AuditWriter>,
     pub(super) sockets: LinkSockets,
     pub(super) network: NetworkSlot<N>,
@@ -106,7 +107,8 @@ pub(super) async fn build<N: RosNetwork>(
     let of_metrics = config.metrics.as_ref().map(MetricsConfig::warnings).unwrap_or_default();
     let warnings = config.warnings();
     warnings.iter().chain(&of_metrics).chain(&rules.warnings).for_each(|warning| warn!("{warning}"));
-    let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
+    let names = PeerNames::from(rules.names.clone());
+    let (audit, audit_writer) = open_audit(&config, state.as_deref(), names.clone())?;
     let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());
     let sockets = LinkSockets::bind(&config, &identity, &rules, &anchors)?;
     let mut rng = system_rng()?;
@@ -143,7 +145,7 @@ pub(super) async fn build<N: RosNetwork>(
             Authority::new(wanted.fleet.clone(), operators, identity.node_id())
         }),
         epoch_messages_max: config.rotation.messages,
-        rates: PeerRates::new(config.peer_rate),
+        rates: PeerRates::new(config.peer_rate, names.clone()),
         keeper: StateWriter::spawn(state.clone(), config.identity.clone(), run_lock.clone(), alive.clone()),
         redial,
         alive,
@@ -159,6 +161,7 @@ pub(super) async fn build<N: RosNetwork>(
         events: events.downgrade(),
         transport: sockets.metrics.clone(),
         audit: audit.clone(),
+        names: names.clone(),
         storage,
     });
     let channels = CoreChannels { events, inbox, requested, on_redial, all_ended };
@@ -169,6 +172,7 @@ pub(super) async fn build<N: RosNetwork>(
         state,
         run_lock,
         audit,
+        names,
         audit_writer,
         sockets,
         network,
@@ -347,11 +351,11 @@ pub(crate) async fn listen_for_clients(
 fn open_audit(
     config: &Config,
     state: Option<&Path>,
-    rules: &Rules,
+    names: PeerNames,
 ) -> Result<(Audit, Option<AuditWriter>), NodeError> {
     let path = audit::audit_path(config.audit.file.as_deref(), state);
     let Some(path) = path.filter(|_| !config.audit.off) else { return Ok((Audit::default(), None)) };
-    let (audit, writer) = Audit::open(&path, config.audit.room, rules.names.clone())
-        .map_err(|source| NodeError::Audit { path, source })?;
+    let (audit, writer) =
+        Audit::open(&path, config.audit.room, names).map_err(|source| NodeError::Audit { path, source })?;
     Ok((audit, Some(writer)))
 }

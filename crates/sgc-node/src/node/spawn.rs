@@ -91,7 +91,7 @@ pub(super) async fn spawn<N: RosNetwork>(
         of_tokens: rules.routers.clone(),
         nearby,
     });
-    let lanes = LaneAdmission::default();
+    let lanes = LaneAdmission::new(node.names.clone());
     let admission = || Admission {
         core: events.clone(),
         credentials: sockets.credentials.clone(),
@@ -124,6 +124,7 @@ pub(super) async fn spawn<N: RosNetwork>(
         credentials: sockets.credentials,
         state: node.state,
         audit: audit.clone(),
+        names: node.names,
         events: events.clone(),
         has_ros: AtomicBool::new(network.get().is_some()),
         gateway: gateway.clone(),

@@ -13,7 +13,6 @@ mod quota;
 mod recent;
 mod record;
 
-use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -22,10 +21,8 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use arc_swap::ArcSwap;
 pub use sgc_config::AuditRoom;
 use sgc_sync::lock;
-use sgc_wire::NodeId;
 use tracing::warn;
 
 use self::file::LogFile;
@@ -39,6 +36,7 @@ pub use self::record::{AUDIT_ID_CHARS, AuditEvent, AuditRecord};
 use crate::clock::now;
 use crate::control::faults::alerts::Alert;
 use crate::state::is_storage_fault;
+pub use crate::state::peer_names::PeerNames;
 
 /// Records that may wait to be written.
 const WAITING_MAX: usize = 1024;
@@ -50,9 +48,6 @@ const RETRY_EVERY: Duration = Duration::from_secs(5);
 const SUMMARY_DELAY: Duration = Duration::from_secs(60);
 const FILE_NAME: &str = "audit.jsonl";
 
-/// Names of peers.
-pub type PeerNames = BTreeMap<NodeId, String>;
-
 /// Handle of the log, cheap to clone. A log that is switched off accepts records and drops them.
 #[derive(Clone, Debug, Default)]
 pub struct Audit {
@@ -63,7 +58,7 @@ pub struct Audit {
 struct AuditInner {
     records: SyncSender<Option<AuditRecord>>,
     losses: Arc<Losses>,
-    names: ArcSwap<PeerNames>,
+    names: PeerNames,
     quotas: Arc<Mutex<Quotas>>,
     recent: Mutex<Recent>,
 }
@@ -140,7 +135,7 @@ impl Audit {
         let shared = Arc::new(AuditInner {
             records,
             losses: losses.clone(),
-            names: ArcSwap::from_pointee(names),
+            names,
             quotas: quotas.clone(),
             recent: Mutex::default(),
         });
@@ -155,7 +150,7 @@ impl Audit {
     pub fn write(&self, mut record: AuditRecord) {
         let Some(shared) = &self.shared else { return };
         if let Cause::Peer(peer) = &record.cause {
-            record.peer_name = shared.names.load().get(peer).cloned();
+            record.peer_name = shared.names.get(peer);
         }
         let mut records = Vec::with_capacity(1);
         lock(&shared.quotas).handle(record, &mut records);
@@ -174,18 +169,6 @@ impl Audit {
     /// Returns the last ones about the keeping of the fleet, at most [`RECENT_OF_FLEET_MAX`].
     pub(crate) fn recent_of_fleet(&self) -> Option<Vec<AuditRecord>> {
         Some(lock(&self.shared.as_ref()?.recent).of_fleet())
-    }
-
-    /// Replaces the names of peers.
-    pub fn set_names(&self, names: PeerNames) {
-        if let Some(shared) = &self.shared {
-            shared.names.store(Arc::new(names));
-        }
-    }
-
-    /// Returns the name of a peer, if it has one.
-    pub fn name_of(&self, peer: &NodeId) -> Option<String> {
-        self.shared.as_ref()?.names.load().get(peer).cloned()
     }
 
     /// Returns the number of records lost since the node started.

@@ -5,6 +5,7 @@
 pub mod audit;
 pub(crate) mod credentials;
 pub(crate) mod fleet_file;
+pub(crate) mod peer_names;
 pub(crate) mod records;
 pub(crate) mod run_lock;
 pub(crate) mod storage;

@@ -35,14 +35,14 @@ impl<N: RosNetwork> Core<N> {
         let reason = CloseReason::InUse(place.clone());
         self.links.close(link, reason.to_string(), reason);
         if !alive {
-            info!(%link, peer = self.called(&node), %remote, %place, "a newer process of the node takes the place of this link");
+            info!(%link, peer = self.names.called(&node), %remote, %place, "a newer process of the node takes the place of this link");
             return;
         }
         if let Some(holder) = by.and_then(|by| self.links.get(by)) {
             holder.notify(Control::IdentityInUse { place: Place::from(remote) });
         }
         self.control_drops.count_from(NodeDrop::IdentityInUse, node);
-        let called = self.called(&node);
+        let called = self.names.called(&node);
         if self.alerts.peer_in_use(node, &place, remote, Instant::now()) {
             warn!(
                 "the identity {called} is in use at two places: {place} has its links, {remote} is kept out"
@@ -96,7 +96,7 @@ impl<N: RosNetwork> Core<N> {
         let ahead_ms = self.router.clock_ahead_ms(link).filter(|ms| clocks_differ(*ms));
         let Some(ahead_ms) = ahead_ms else { return };
         if self.control_drops.count_from(NodeDrop::ClocksDiffer, link) {
-            let (peer, remote) = (self.called(&entry.peer().node_id), entry.remote().to_string());
+            let (peer, remote) = (self.names.called(&entry.peer().node_id), entry.remote().to_string());
             let alert = Alert::ClocksDiffer { peer, remote, ahead_ms };
             warn!("{alert}; {}", alert.fix());
         }
@@ -130,7 +130,7 @@ impl<N: RosNetwork> Core<N> {
         let now = now();
         let mut alerts = Vec::from_iter(clock_alert(self.certificates.identity(), now.unix));
         let node = self.certificates.identity().node_name().as_str();
-        alerts.extend(self.alerts.shown(node, |peer| self.called(peer), now.instant));
+        alerts.extend(self.alerts.shown(node, |peer| self.names.called(peer), now.instant));
         alerts.extend(sgc_dds::unsent().and_then(|unsent| {
             let ago_s = now.instant.saturating_duration_since(unsent.last).as_secs();
             let (to, packets) = (unsent.to, unsent.packets);
@@ -148,7 +148,7 @@ impl<N: RosNetwork> Core<N> {
         alerts.extend(self.owners_here().into_iter().map(|node| Alert::SameLocalNetwork { node }));
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {
             let ahead_ms = self.router.clock_ahead_ms(id).filter(|ms| clocks_differ(*ms))?;
-            let peer = self.called(&entry.peer().node_id);
+            let peer = self.names.called(&entry.peer().node_id);
             Some(Alert::ClocksDiffer { peer, remote: entry.remote().to_string(), ahead_ms })
         }));
         alerts

@@ -9,7 +9,7 @@ use sgc_ros::{
     ShareView, UseView, dds_topic, dds_type, matches, reader_for, ros_topic, ros_type, weakest,
 };
 use sgc_trust::{Grantees, Policy};
-use sgc_wire::{CatalogueEntry, Kind, Name, NodeId, PayloadForm, Role};
+use sgc_wire::{CatalogueEntry, Kind, Name, PayloadForm, Role};
 use tokio::sync::oneshot;
 
 use super::Core;
@@ -19,7 +19,6 @@ use crate::admin::graph::{
 };
 use crate::admin::route_words::owner_state;
 use crate::data::tap::{Tap, TapError, TapMessage, TapQueue, TapRequest, Taps};
-use crate::state::audit::Audit;
 
 impl<N: RosNetwork> Core<N> {
     pub(super) fn graph(&self, asked: Option<Name>) -> Graph {
@@ -39,7 +38,7 @@ impl<N: RosNetwork> Core<N> {
             Link {
                 id: id.0,
                 peer: peer.to_string(),
-                name: self.audit.name_of(&peer),
+                name: self.names.get(&peer),
                 remote: entry.remote().to_string(),
                 rtt_us: entry.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 silent,
@@ -116,12 +115,16 @@ impl<N: RosNetwork> Core<N> {
         };
         for route in view.routes {
             names.insert(route.name);
-            let granted: BTreeSet<_> =
-                self.endpoint.granted(&route.name).into_iter().map(|(_, peer)| self.called(&peer)).collect();
+            let granted: BTreeSet<_> = self
+                .endpoint
+                .granted(&route.name)
+                .into_iter()
+                .map(|(_, peer)| self.names.called(&peer))
+                .collect();
             let role = if is_service { Role::Publish } else { Role::Subscribe };
             let mut consumer_hashes = BTreeMap::<_, BTreeSet<_>>::new();
             for (peer, hash) in self.consumers.hashes(route.name, role) {
-                consumer_hashes.entry(self.called(&peer)).or_default().insert(hash.to_owned());
+                consumer_hashes.entry(self.names.called(&peer)).or_default().insert(hash.to_owned());
             }
             let refused = self.refused.for_name(&route.name);
             let sink = self.sinks.get(&route.name);
@@ -136,7 +139,7 @@ impl<N: RosNetwork> Core<N> {
                 qos: route.qos.as_ref().map(Into::into),
                 granted: granted.into_iter().collect(),
                 consumer_hashes,
-                refused: refused.map(|(peer, why)| (self.called(peer), why.clone())).collect(),
+                refused: refused.map(|(peer, why)| (self.names.called(peer), why.clone())).collect(),
                 messages: self.shares.get(&route.name).map_or(0, |share| share.published()),
                 written: sink.map_or(0, |sink| sink.delivered()),
                 matched: sink.map_or(0, |sink| sink.matched()),
@@ -241,7 +244,7 @@ impl<N: RosNetwork> Core<N> {
         problems.extend(self.members.misspelt().map(|(written, meant)| {
             format!("a rule names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant")
         }));
-        problems.extend(self.types.problems(|owner| self.called(owner)));
+        problems.extend(self.types.problems(|owner| self.names.called(owner)));
         problems
     }
 
@@ -259,11 +262,6 @@ impl<N: RosNetwork> Core<N> {
             line.dropped = stats.reasons();
         }
         line
-    }
-
-    /// Returns a peer's name, or the beginning of its id.
-    pub(super) fn called(&self, peer: &NodeId) -> String {
-        called(&self.audit, peer)
     }
 
     /// Opens a tap. A topic from the far side is tapped there, since this node's writers are hidden from its own
@@ -364,11 +362,6 @@ impl<N: RosNetwork> Core<N> {
             let _ = reply.send(tap.map_err(|why| TapError::Network(why.to_string())));
         });
     }
-}
-
-/// Returns a peer's name, or the beginning of its id.
-pub(super) fn called(audit: &Audit, peer: &NodeId) -> String {
-    audit.name_of(peer).unwrap_or_else(|| peer.short())
 }
 
 fn is_called(entry: &CatalogueEntry) -> bool {

@@ -37,7 +37,7 @@ impl<N: RosNetwork> Core<N> {
         self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
         let rtt = link.stats().rtt;
         let id = self.links.add(Instant::now(), link.clone(), url, control);
-        info!(link = id.0, %remote, peer = self.called(&link.peer().node_id), "link is up");
+        info!(link = id.0, %remote, peer = self.names.called(&link.peer().node_id), "link is up");
         self.control_drops.link_up(id);
         self.data.drops().link_up(id);
         let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
@@ -60,7 +60,7 @@ impl<N: RosNetwork> Core<N> {
         self.data.drops().link_down(id);
         if let Some(EndedLink { node, remote, closed_for }) = self.links.remove(id) {
             let end = end.as_deref().or(closed_for.as_deref()).unwrap_or("its task ended");
-            info!(link = id.0, %remote, peer = self.called(&node), "link ended: {end}");
+            info!(link = id.0, %remote, peer = self.names.called(&node), "link ended: {end}");
             let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&node).remote(remote);
             self.audit.write(match closed_for {
                 Some(reason) => record.reason(reason),

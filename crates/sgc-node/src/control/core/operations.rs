@@ -115,7 +115,7 @@ impl<N: RosNetwork> Core<N> {
                     }
                 };
                 if self.control_drops.count_from(NodeDrop::OperationNotPermitted, node) {
-                    let node = self.called(&node);
+                    let node = self.names.called(&node);
                     warn!("refused an operation of {node}, {what}; counted from here on");
                 }
                 self.audit.write(AuditRecord::new(AuditEvent::Refused).peer(&node).reason(reason));
@@ -134,7 +134,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Answers an operation that was carried out or refused, and announces a revocation to everyone.
     pub(super) fn operation_done(&mut self, done: OperationOutcome) {
-        info!("{} asked for an operation: {}", self.called(&done.node), done.said);
+        info!("{} asked for an operation: {}", self.names.called(&done.node), done.said);
         // Where a node joined, the record is its own: the holder of an invitation may have used up its share.
         let peer = done.joined.as_ref().unwrap_or(&done.node);
         self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(peer).reason(&done.said));

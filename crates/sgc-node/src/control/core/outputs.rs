@@ -8,7 +8,7 @@ use sgc_transport::CloseReason;
 use sgc_wire::{Name, Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
 
-use super::{Core, graph};
+use super::Core;
 use crate::clock::now;
 use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
@@ -42,7 +42,7 @@ impl<N: RosNetwork> Core<N> {
                 let is_told =
                     dropped.reason.is_suspicious() || matches!(dropped.reason, DropReason::ListFlood { .. });
                 if first && is_told {
-                    let peer = dropped.peer.map(|p| self.called(&p)).unwrap_or_default();
+                    let peer = dropped.peer.map(|p| self.names.called(&p)).unwrap_or_default();
                     warn!(link = %dropped.link, peer, reason = %dropped.reason, "control frame refused; counted from here on");
                 } else {
                     debug!(link = %dropped.link, reason = %dropped.reason, "control frame refused");
@@ -65,16 +65,16 @@ impl<N: RosNetwork> Core<N> {
                 let record = AuditRecord::new(AuditEvent::Revoked).peer(&node);
                 self.audit.write(record.remote(remote).reason("its link is cut"));
                 let why = self.certificates.objection(peer, now().unix).unwrap_or(CloseReason::Revoked);
-                info!(%link, peer = self.called(&node), "{why}; its link is closed");
+                info!(%link, peer = self.names.called(&node), "{why}; its link is closed");
                 because = why.to_string();
                 why
             }
             LinkClose::Expired => {
-                info!(%link, peer = self.called(&node), "the peer's certificate has ended; its link is closed");
+                info!(%link, peer = self.names.called(&node), "the peer's certificate has ended; its link is closed");
                 CloseReason::Expired
             }
             LinkClose::TooMany | LinkClose::Forgeries => {
-                warn!(%link, %remote, peer = self.called(&node), "{reason}; its link is closed");
+                warn!(%link, %remote, peer = self.names.called(&node), "{reason}; its link is closed");
                 CloseReason::Denied(because.clone())
             }
             LinkClose::Greeting | LinkClose::Loop => {
@@ -171,7 +171,7 @@ impl<N: RosNetwork> Core<N> {
         let Some(routes) = &mut self.routes else { return };
         match event {
             Event::SinkJoined { name, sink, peer, role } => {
-                info!("granted {} to {}", shown(routes, &name), graph::called(&self.audit, &peer));
+                info!("granted {} to {}", shown(routes, &name), self.names.called(&peer));
                 debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
                 self.refused.forget(&name, &peer);
                 if role == Role::Subscribe || routes.is_service(&name) {
@@ -187,7 +187,7 @@ impl<N: RosNetwork> Core<N> {
             Event::SinkCut { name, sink, peer, reason } => {
                 info!(
                     "{} no longer gets {}: {reason}; the others get a new key",
-                    graph::called(&self.audit, &peer),
+                    self.names.called(&peer),
                     shown(routes, &name)
                 );
                 debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
@@ -202,7 +202,7 @@ impl<N: RosNetwork> Core<N> {
                     warn!(
                         "refused {} to {}: {reason}; counted from here on",
                         shown(routes, &name),
-                        graph::called(&self.audit, &peer)
+                        self.names.called(&peer)
                     );
                 }
             }
@@ -221,18 +221,12 @@ impl<N: RosNetwork> Core<N> {
                 self.types_listed(owner);
             }
             Event::OwnerLost { owner, reason } => {
-                info!(
-                    "{} is out of reach: its topics and services wait for it",
-                    graph::called(&self.audit, &owner)
-                );
+                info!("{} is out of reach: its topics and services wait for it", self.names.called(&owner));
                 debug!(owner = %owner.short(), ?reason, "owner out of reach");
                 routes.handle_owner_lost(owner, reason);
             }
             Event::OwnerRefused { owner, by } => {
-                warn!(
-                    "{} tells this node nothing of what it shares: {by}",
-                    graph::called(&self.audit, &owner)
-                );
+                warn!("{} tells this node nothing of what it shares: {by}", self.names.called(&owner));
                 routes.handle_owner_refused(owner, by);
             }
             Event::RenewAsked { .. }

@@ -38,7 +38,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn report_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, question: &Bytes) {
         let answer = match ReportQuestion::from_slice(question) {
             _ if !self.reports.may_ask(peer) => {
-                let node = self.called(&peer.node_id);
+                let node = self.names.called(&peer.node_id);
                 if self.control_drops.count_from(NodeDrop::ReportNotPermitted, peer.node_id) {
                     warn!("refused a report to {node}, which is no observer; counted from here on");
                 }
@@ -148,7 +148,7 @@ impl<N: RosNetwork> Core<N> {
             let peer = entry.peer().node_id;
             ReportLink {
                 peer: peer.to_string(),
-                name: self.audit.name_of(&peer),
+                name: self.names.get(&peer),
                 rtt_us: entry.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 silent: self.router.link_cost(id).is_some_and(|(_, is_silent)| is_silent),
                 dialled: entry.url().is_some(),

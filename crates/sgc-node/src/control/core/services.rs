@@ -219,7 +219,7 @@ impl<N: RosNetwork> Core<N> {
             CallerId::Source(source) => {
                 let sink = *self.endpoint.publishers(name).get(&source)?;
                 let granted = self.endpoint.granted(name);
-                granted.into_iter().find(|(id, _)| *id == sink).map(|(_, peer)| self.called(&peer))
+                granted.into_iter().find(|(id, _)| *id == sink).map(|(_, peer)| self.names.called(&peer))
             }
         }
     }

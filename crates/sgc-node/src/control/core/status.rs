@@ -152,7 +152,7 @@ impl<N: RosNetwork> Core<N> {
         let audit = audit.into_iter().filter(|(_, n)| *n > 0).map(|(kind, n)| (kind.key().to_owned(), n));
         let mut all: BTreeMap<String, u64> = audit.collect();
         for counts in [
-            self.control_drops.snapshot(),
+            self.control_drops.snapshot_by_name(&self.names),
             self.data.drops().snapshot(),
             self.data.rates().drops(),
             self.ros_failures.snapshot(),

@@ -111,7 +111,7 @@ impl<N: RosNetwork> Core<N> {
         if let Err(why) = &answer
             && self.control_drops.count_from(why.counter(), node)
         {
-            warn!(peer = self.called(&node), %why, "refused credentials; counted from here on");
+            warn!(peer = self.names.called(&node), %why, "refused credentials; counted from here on");
         }
         if answer.is_ok()
             && let Some(authority) = &mut self.authority
@@ -157,7 +157,7 @@ impl<N: RosNetwork> Core<N> {
         let refused: Vec<_> = refused.map(|(link, entry)| (link, entry.peer().node_id)).collect();
         for (link, node) in refused {
             let why = CloseReason::not_admitted();
-            info!(%link, peer = self.called(&node), "{why}; its link is closed");
+            info!(%link, peer = self.names.called(&node), "{why}; its link is closed");
             self.links.close(link, why.to_string(), why);
         }
     }

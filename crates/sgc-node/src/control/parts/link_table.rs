@@ -22,6 +22,7 @@ use crate::data::dataplane::Out;
 use crate::data::outflow::OutFlow;
 use crate::data::stats::CountDrops;
 use crate::link::control_tx::ControlTx;
+use crate::state::audit::PeerNames;
 
 /// Interval of looks at the links.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
@@ -45,6 +46,7 @@ pub(crate) struct LinkTable {
     /// Time of the next look at the links; `None` while there are none.
     look_due: Option<Instant>,
     policies: PeerPolicies,
+    names: PeerNames,
     /// Counts the packets that queues leave out.
     drops: Arc<dyn CountDrops>,
     /// Bytes that were sent and received over links that have ended.
@@ -68,9 +70,9 @@ pub(crate) struct EndedLink {
 
 impl LinkTable {
     /// Creates the table without links. New links use the keep-alive policy.
-    pub(crate) fn new(policy: KeepAlivePolicy, drops: Arc<dyn CountDrops>) -> Self {
+    pub(crate) fn new(policy: KeepAlivePolicy, names: PeerNames, drops: Arc<dyn CountDrops>) -> Self {
         let policies = PeerPolicies::new(policy);
-        Self { links: BTreeMap::new(), next: 1, look_due: None, policies, drops, ended_bytes: (0, 0) }
+        Self { links: BTreeMap::new(), next: 1, look_due: None, policies, names, drops, ended_bytes: (0, 0) }
     }
 
     /// Adds a link, and looks at it from here on.
@@ -148,7 +150,7 @@ impl LinkTable {
         let looks = self.links.iter_mut().map(|(id, entry)| {
             let stats = entry.link.stats();
             entry.control.lanes().look(now, &stats);
-            let is_silent = entry.look(now, stats.received_bytes, stats.rtt);
+            let is_silent = entry.look(now, stats.received_bytes, stats.rtt, &self.names);
             LinkMeasurement { link: *id, rtt: stats.rtt, is_silent }
         });
         looks.collect()
@@ -262,7 +264,7 @@ impl LinkEntry {
     }
 
     /// Looks at a link, and probes the peer or marks it silent if needed. Returns `true` if the link seems dead.
-    fn look(&mut self, now: Instant, received_bytes: u64, rtt: Duration) -> bool {
+    fn look(&mut self, now: Instant, received_bytes: u64, rtt: Duration, names: &PeerNames) -> bool {
         let (activity, remote) = (self.control.activity(), self.link.remote());
         let verdict = self.keep_alive.look(now, LinkObservation { received_bytes, activity, remote, rtt });
         if verdict.asks {
@@ -270,7 +272,8 @@ impl LinkEntry {
             self.control.send(Control::Probe { answers: false });
         }
         if verdict.is_dead() && self.closed_for.is_none() {
-            info!(%remote, peer = %self.link.peer().node_id.short(), "the peer does not answer; its link is closed");
+            let peer = names.called(&self.link.peer().node_id);
+            info!(%remote, peer, "the peer does not answer; its link is closed");
             self.closed_for = Some(CloseReason::Silent.to_string());
             self.link.close(CloseReason::Silent);
         }
@@ -327,7 +330,7 @@ mod tests {
             let url = listener.local().to_string().parse().unwrap();
             let dialer = Dialer::new(arm, LinkOptions::default(), Arc::default());
             let data = Arc::<DataPlane>::default();
-            let table = LinkTable::new(KeepAlivePolicy::default(), data.clone());
+            let table = LinkTable::new(KeepAlivePolicy::default(), PeerNames::default(), data.clone());
             Self { dialer, listener, url, dialled, far: Vec::new(), table, data }
         }
 

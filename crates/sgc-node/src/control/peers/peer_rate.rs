@@ -13,6 +13,7 @@ use sgc_wire::NodeId;
 use tracing::warn;
 
 use crate::drops::NodeDrop;
+use crate::state::audit::PeerNames;
 
 /// Time's worth of rate that a peer may save up, at least [`BURST_BYTES_MIN`].
 const BURST: Duration = Duration::from_millis(250);
@@ -25,6 +26,7 @@ const PEERS_MAX: usize = 4096;
 #[derive(Debug)]
 pub(crate) struct PeerRates {
     limit: Option<Limit>,
+    names: PeerNames,
     /// Buckets by peer. They are looked up when a link begins and for the status.
     peers: Mutex<BTreeMap<NodeId, Arc<PeerRate>>>,
     /// Packets dropped of forgotten peers.
@@ -41,19 +43,19 @@ struct Limit {
 
 impl Default for PeerRates {
     fn default() -> Self {
-        Self::new(None)
+        Self::new(None, PeerNames::default())
     }
 }
 
 impl PeerRates {
     /// Creates buckets with the same limit for every peer, in bits a second.
-    pub(crate) fn new(limit: Option<u64>) -> Self {
+    pub(crate) fn new(limit: Option<u64>, names: PeerNames) -> Self {
         let limit = limit.map(|bits_per_second| {
             let mut limit = Limit { bits_per_second, burst_ns: 0, origin: Instant::now() };
             limit.burst_ns = nanos(BURST).max(limit.cost_ns(BURST_BYTES_MIN));
             limit
         });
-        Self { limit, peers: Mutex::default(), gone: AtomicU64::new(0) }
+        Self { limit, names, peers: Mutex::default(), gone: AtomicU64::new(0) }
     }
 
     /// Returns the bucket of a peer with a link, if there is a limit. It outlives the link until the traffic is paid
@@ -77,7 +79,12 @@ impl PeerRates {
         {
             self.gone.fetch_add(rate.over().dropped, Relaxed);
         }
-        Some(peers.entry(peer).or_insert_with(|| Arc::new(PeerRate::new(peer, limit))).clone())
+        Some(
+            peers
+                .entry(peer)
+                .or_insert_with(|| Arc::new(PeerRate::new(peer, self.names.clone(), limit)))
+                .clone(),
+        )
     }
 
     /// Returns the counts of delayed and dropped packets of a peer.
@@ -95,7 +102,7 @@ impl PeerRates {
             let dropped = rate.over().dropped;
             all += dropped;
             if dropped > 0 && Arc::strong_count(rate) > 1 {
-                drops.insert(format!("{key} from {}", peer.short()), dropped);
+                drops.insert(format!("{key} from {}", self.names.called(peer)), dropped);
             }
         }
         drops.extend((all > 0).then(|| (key.to_owned(), all)));
@@ -132,6 +139,7 @@ pub(crate) struct Over {
 #[derive(Debug)]
 pub(crate) struct PeerRate {
     peer: NodeId,
+    names: PeerNames,
     limit: Limit,
     /// Time at which all packets are paid for.
     all_ns: AtomicU64,
@@ -143,9 +151,10 @@ pub(crate) struct PeerRate {
 }
 
 impl PeerRate {
-    fn new(peer: NodeId, limit: Limit) -> Self {
+    fn new(peer: NodeId, names: PeerNames, limit: Limit) -> Self {
         Self {
             peer,
+            names,
             limit,
             all_ns: AtomicU64::new(0),
             hasty_ns: AtomicU64::new(0),
@@ -206,7 +215,10 @@ impl PeerRate {
 
     fn name_it(&self, what: &str) {
         if !self.is_named.swap(true, Relaxed) {
-            warn!(peer = %self.peer.short(), "a peer sends more than `peer_rate` lets it: {what}, and counted from here on");
+            warn!(
+                peer = self.names.called(&self.peer),
+                "a peer sends more than `peer_rate` lets it: {what}, and counted from here on"
+            );
         }
     }
 }
@@ -220,7 +232,7 @@ mod tests {
 
     /// 8 Mbit/s: one packet a millisecond, and 262 144 bytes at once.
     fn rate() -> Arc<PeerRate> {
-        PeerRates::new(Some(8_000_000)).for_peer(NodeId([1; 32])).unwrap()
+        PeerRates::new(Some(8_000_000), PeerNames::default()).for_peer(NodeId([1; 32])).unwrap()
     }
 
     #[test]
@@ -261,7 +273,7 @@ mod tests {
 
     #[test]
     fn linking_again_gains_nothing() {
-        let rates = PeerRates::new(Some(8_000_000));
+        let rates = PeerRates::new(Some(8_000_000), PeerNames::default());
         let of = |now, id| rates.for_peer_at(now, NodeId([id; 32])).unwrap();
         let first = of(0, 1);
         assert!(Arc::ptr_eq(&first, &of(0, 1)));
@@ -278,6 +290,6 @@ mod tests {
             "and its drops are in the total"
         );
         let one = NodeId([1; 32]);
-        assert!(PeerRates::new(None).for_peer(one).is_none());
+        assert!(PeerRates::default().for_peer(one).is_none());
     }
 }

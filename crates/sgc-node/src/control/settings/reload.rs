@@ -34,7 +34,7 @@ use crate::metrics::Metrics;
 use crate::node::build::listen_for_clients;
 use crate::node::error::NodeError;
 use crate::node::identity::{FileIdentity, wanted_nearby};
-use crate::state::audit::{Audit, AuditEvent, AuditRecord};
+use crate::state::audit::{Audit, AuditEvent, AuditRecord, PeerNames};
 use crate::state::credentials::with_kept_crls;
 
 /// Reads the configuration from the same source as at start.
@@ -64,6 +64,7 @@ pub(crate) struct Reloader {
     pub(crate) credentials: CredentialStore,
     pub(crate) state: Option<PathBuf>,
     pub(crate) audit: Audit,
+    pub(crate) names: PeerNames,
     pub(crate) events: mpsc::Sender<CoreEvent>,
     /// Joins the local network if the node began without one; blocks. `None` if the node cannot join one.
     pub(crate) join: Option<JoinNetwork>,
@@ -257,7 +258,7 @@ impl Reloader {
             report.warnings.extend(config.metrics.iter().flat_map(MetricsConfig::warnings));
             report.changed.extend(metrics_changes(running.config.metrics.as_ref(), config.metrics.as_ref()));
         }
-        self.audit.set_names(rules.names.clone());
+        self.names.set(rules.names.clone());
         running.config = merged(running.config.clone(), config);
         running.rules = rules;
         report.changed.dedup();

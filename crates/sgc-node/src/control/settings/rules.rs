@@ -1,7 +1,7 @@
 //! [`Rules`]: everything that follows from a configuration and its files at one moment, such as rules for the route
 //! machine, CAs and routers. Start and reload use the same code.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
@@ -17,7 +17,6 @@ use crate::control::fleet::members::{MemberNames, unknown_members};
 use crate::control::fleet::partners::{PartnerError, Partners};
 use crate::control::settings::policy;
 use crate::state;
-use crate::state::audit::PeerNames;
 use crate::state::fleet_file::read_fleet;
 
 /// Most routers that tokens may add.
@@ -31,7 +30,7 @@ pub(crate) struct Rules {
     pub(crate) partners: Partners,
     /// Routers of tokens that the configuration does not name.
     pub(crate) routers: Vec<RouterUrl>,
-    pub(crate) names: PeerNames,
+    pub(crate) names: BTreeMap<NodeId, String>,
     pub(crate) members: MemberNames,
     /// The peers that may ask this node how it is doing.
     pub(crate) observers: Grantees,
@@ -201,8 +200,8 @@ fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
 }
 
 /// Returns the names that the configuration has for peers.
-fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> PeerNames {
-    let mut names = PeerNames::new();
+fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> BTreeMap<NodeId, String> {
+    let mut names = BTreeMap::new();
     for (partner, resolved) in config.partners.iter().zip(rules.partners.configured.values()) {
         let name = |node: &NodeId| (*node, format!("partner:{}", partner.name));
         names.extend(resolved.nodes.iter().map(name));
