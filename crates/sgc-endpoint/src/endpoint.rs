@@ -356,6 +356,17 @@ impl Endpoint {
         self.joiner.recover(&mut self.cx, name, source, from, to);
     }
 
+    /// Confirms to the owner of a granted name that everything of a source up to `seq` is here
+    /// ([`crate::Delivery::Confirm`]).
+    pub fn confirm(&mut self, name: Name, source: SourceId, seq: u64) {
+        self.joiner.confirm(&mut self.cx, name, source, seq);
+    }
+
+    /// Iterates over the nodes that receive a share of this node; a node comes once for each of its sinks.
+    pub fn subscribers(&self, name: &Name) -> impl Iterator<Item = NodeId> {
+        self.owner.subscribers(name)
+    }
+
     /// Returns the status of a join.
     pub fn join_status(&self, name: &Name) -> Option<JoinStatus> {
         self.joiner.status(name)

@@ -145,6 +145,13 @@ impl Joiner {
         }
     }
 
+    /// Confirms to the owner of a granted name that everything of a source up to `seq` is here.
+    pub(crate) fn confirm(&mut self, cx: &mut Context, name: Name, source: SourceId, seq: u64) {
+        if let Some(sink) = self.sink_of(&name) {
+            cx.send(Control::Recover(Recover::confirmation(name, sink, source, seq)));
+        }
+    }
+
     /// Returns the status of a join.
     pub(crate) fn status(&self, name: &Name) -> Option<JoinStatus> {
         self.joins.get(name).map(Join::status)

@@ -6,7 +6,7 @@ use std::time::Instant;
 use sgc_trust::{GrantError, SignedError};
 use sgc_wire::{
     Catalogue, Consumer, Control, Credentials, DescribedType, Name, NodeId, OperationAnswer, Recover,
-    RefuseReason, Report, Role, SinkId, TopicGrant,
+    RefuseReason, Report, Role, SinkId, SourceId, TopicGrant,
 };
 
 use crate::joins::{LostReason, RefusedBy};
@@ -153,6 +153,17 @@ pub enum Event {
     },
     /// A granted sink asks one of this node's sources for messages.
     Recover(Recover),
+    /// A granted sink confirms that it has everything of one of this node's sources up to a number.
+    Confirmed {
+        /// The name.
+        name: Name,
+        /// The source.
+        source: SourceId,
+        /// The node of the sink.
+        peer: NodeId,
+        /// The number.
+        seq: u64,
+    },
     /// A join was granted, or its grant changed.
     Granted {
         /// The name.

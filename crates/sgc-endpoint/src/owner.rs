@@ -165,6 +165,11 @@ impl Owner {
         }
     }
 
+    /// Iterates over the nodes that receive a share.
+    pub(crate) fn subscribers(&self, name: &Name) -> impl Iterator<Item = NodeId> {
+        self.shares.get(name).into_iter().flat_map(Share::subscribers)
+    }
+
     /// Begins a new epoch of a share.
     pub(crate) fn rotate(&mut self, cx: &mut Context, name: &Name) {
         if let Some(share) = self.shares.get_mut(name) {

@@ -450,7 +450,7 @@ impl Sink {
         if let Some(head) = head.filter(|head| head.kind == MessageKind::Mark) {
             // A resent assertion is no news of a publisher's liveliness.
             let asserted = head.asserted().filter(|_| header.to.is_none() && !source.recovers());
-            let Some(publisher) = asserted else { return source.take_mark(header, opened.text()) };
+            let Some(publisher) = asserted else { return source.take_mark(header, &head, opened.text()) };
             oldest_of_mark(header, opened.text())?;
             source.done(header.seq);
             return Ok(self.asserted(&header.source, publisher));

@@ -279,12 +279,21 @@ impl Source {
     }
 
     /// Tells all sinks the last number, so that those that missed it notice; nothing if no message could be asked for.
-    pub fn mark(&mut self, mut emit: impl FnMut(Packet)) {
+    pub fn mark(&mut self, emit: impl FnMut(Packet)) {
+        self.publish_mark(&MessageHead::new(MessageKind::Mark, 0), emit);
+    }
+
+    /// Does the same as [`Self::mark`], and asks all sinks to confirm that they have everything up to there.
+    pub fn ask_for_confirmation(&mut self, emit: impl FnMut(Packet)) {
+        self.publish_mark(&MessageHead::for_confirmation(), emit);
+    }
+
+    fn publish_mark(&mut self, head: &MessageHead, mut emit: impl FnMut(Packet)) {
         self.flush(&mut emit);
         if !self.progress.recovers || self.seq == 0 || self.seq >= SOURCE_MESSAGES_MAX {
             return;
         }
-        self.seal_mark(&mut emit);
+        self.seal_mark(head, &mut emit);
         self.flush(emit);
     }
 
@@ -322,7 +331,7 @@ impl Source {
         };
         let gone = from > 0 && from < self.history.oldest() && self.progress.recovers;
         if gone && self.history.newest().is_none_or(|m| !m.is_mark()) && self.seq < SOURCE_MESSAGES_MAX {
-            self.seal_mark(&mut emit);
+            self.seal_mark(&MessageHead::new(MessageKind::Mark, 0), &mut emit);
         }
         let mark = self.history.newest().filter(|m| gone && m.is_mark()).map(|m| m.seq);
         let from = if from == 0 { self.history.late_from() } else { from };
@@ -395,17 +404,16 @@ impl Source {
     }
 
     /// Publishes a mark; the caller has room for its number.
-    fn seal_mark(&mut self, emit: &mut impl FnMut(Packet)) {
+    fn seal_mark(&mut self, head: &MessageHead, emit: &mut impl FnMut(Packet)) {
         self.seq += 1;
-        let head = MessageHead::new(MessageKind::Mark, 0);
         // The mark's own place in the history may be that of the oldest message: it reports the state after that.
-        self.keep(HistoryEntry { seq: self.seq, head, payload: Bytes::from_static(&[0; 8]) });
+        self.keep(HistoryEntry { seq: self.seq, head: *head, payload: Bytes::from_static(&[0; 8]) });
         let payload = Bytes::copy_from_slice(&self.history.oldest().to_be_bytes());
         if let Some(mark) = self.history.newest_mut() {
             mark.payload = payload.clone();
         }
         let proof = self.choose_proof(None);
-        self.seal_fragments(None, &proof, self.seq, &head, &payload, emit);
+        self.seal_fragments(None, &proof, self.seq, head, &payload, emit);
     }
 
     fn next_number(&mut self, payload: &Bytes) -> Result<u64, PublishError> {

@@ -231,7 +231,7 @@ fn a_sink_that_comes_back_in_time_finds_the_reader_open() {
 fn a_restarted_publisher_keeps_its_share_and_a_gone_one_loses_it() {
     let mut b = bench(&[("/a", "")], &[]);
     b.appears(writer(1, "/a", Qos::default()));
-    assert_eq!(b.vanishes(1), []);
+    assert!(matches!(b.vanishes(1)[..], [Command::CloseSource { .. }]));
     let again = [b.appears(writer(2, "/a", Qos::default())), b.passes(WRITERLESS_HOLD)].concat();
     assert!(!has(&again, |c| matches!(c, Command::Unshare { .. } | Command::Share(_))), "{again:?}");
     b.vanishes(2);
@@ -266,6 +266,25 @@ fn share_outlives_its_last_publisher_while_messages_of_that_wait() {
     b.routes.hold_share(b.now + WRITERLESS_HOLD, &mine("/a"));
     assert_eq!(b.passes(WRITERLESS_HOLD), []);
     assert_eq!(published(&b.passes(WRITERLESS_HOLD)).0.len(), 1);
+}
+
+#[test]
+fn last_messages_of_a_publisher_that_is_gone_are_to_be_confirmed() {
+    let mut b = bench(&[("/a", ""), ("/latched", "")], &[]);
+    let closed = |commands: Vec<Command>| {
+        let sources = commands.into_iter().filter_map(|c| match c {
+            Command::CloseSource { source, .. } => Some(source),
+            _ => None,
+        });
+        sources.collect::<Vec<_>>()
+    };
+    let source = published(&b.appears(writer(1, "/a", Qos::default()))).1[0].1;
+    assert_eq!(closed(b.vanishes(1)), [source]);
+    // Another publisher takes the source over; when that is gone, it is closed again.
+    b.appears(writer(2, "/a", Qos::default()));
+    assert_eq!(closed(b.vanishes(2)), [source]);
+    let latched_source = published(&b.appears(writer(3, "/latched", latched()))).1[0].1;
+    assert_eq!(closed(b.vanishes(3)), [latched_source]);
 }
 
 #[test]
@@ -1531,7 +1550,7 @@ fn a_restarted_volatile_publisher_takes_its_source_over_and_a_gone_one_is_listed
     // A single publisher keeps its source until the share ends.
     let mut b = bench(&[("/a", "")], &[]);
     let alone = published(&b.appears(writer(1, "/a", Qos::default())));
-    assert_eq!(b.vanishes(1), []);
+    assert_eq!(b.vanishes(1), [Command::CloseSource { name: mine("/a"), source: alone.1[0].1 }]);
     assert_eq!(published(&b.appears(writer(2, "/a", Qos::default()))).0, alone.0);
     assert!(!has(&b.passes(WRITERLESS_HOLD), |c| matches!(c, Command::Unshare { .. })));
 }

@@ -232,7 +232,7 @@ pub struct Hello {
     pub started: UnixMillis,
 }
 
-/// A sink's request for messages. A source does not send messages that it no longer has.
+/// A sink's request for messages, or its confirmation. A source does not send messages that it no longer has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Recover {
     /// Name.
@@ -243,8 +243,20 @@ pub struct Recover {
     pub source: SourceId,
     /// First message.
     pub from: u64,
-    /// Last message.
+    /// Last message; 0 in a confirmation.
     pub to: u64,
+}
+
+impl Recover {
+    /// Returns the confirmation that a sink has all numbers of a source up to `seq`.
+    pub fn confirmation(name: Name, sink: SinkId, source: SourceId, seq: u64) -> Self {
+        Self { name, sink, source, from: seq.saturating_add(1), to: 0 }
+    }
+
+    /// Returns the number up to which the sink has all, if this is a confirmation.
+    pub fn confirmed(&self) -> Option<u64> {
+        if self.to == 0 { self.from.checked_sub(1) } else { None }
+    }
 }
 
 /// The reason why a router refuses a join.
@@ -914,6 +926,7 @@ mod tests {
             Control::Answer { signed: signed.clone() },
             Control::Reject { name, sink, reason: RejectReason::RouteLost },
             Control::Recover(Recover { name, sink, source: SourceId([3; 16]), from: 1, to: 9 }),
+            Control::Recover(Recover::confirmation(name, sink, SourceId([3; 16]), 9)),
             Control::Goodbye,
             Control::Crl { der: Bytes::from_static(b"list") },
             Control::Ack { name, sink, serial: 7 },

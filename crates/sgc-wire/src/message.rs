@@ -60,6 +60,9 @@ pub enum PayloadEncoding {
     Lz4,
 }
 
+/// Time stamp of a mark that asks for a confirmation.
+const CONFIRM: i64 = 1;
+
 /// Travels sealed, behind the first fragment of each message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MessageHead {
@@ -94,6 +97,16 @@ impl MessageHead {
     pub fn asserted(&self) -> Option<[u8; 8]> {
         let says_so = self.kind == MessageKind::Mark && self.source_timestamp_ns != 0;
         says_so.then(|| self.source_timestamp_ns.to_be_bytes())
+    }
+
+    /// Returns the head of a mark that asks all sinks of its source to confirm that they have all numbers up to it.
+    pub const fn for_confirmation() -> Self {
+        Self::new(MessageKind::Mark, CONFIRM)
+    }
+
+    /// Returns `true` for a mark that asks for a confirmation, if its source recovers: others assert a liveliness.
+    pub fn asks_for_confirmation(&self) -> bool {
+        self.kind == MessageKind::Mark && self.source_timestamp_ns == CONFIRM
     }
 
     /// Returns the encoding.
@@ -198,6 +211,15 @@ mod tests {
         assert_eq!(MessageHead::from_slice(&bytes).unwrap().asserted(), Some(publisher));
         assert_eq!(MessageHead::new(MessageKind::Mark, 0).asserted(), None);
         assert_eq!(MessageHead::new(MessageKind::Write, 7).asserted(), None);
+    }
+
+    #[test]
+    fn mark_with_time_stamp_1_asks_for_a_confirmation() {
+        let bytes = MessageHead::for_confirmation().to_vec();
+        assert_eq!(bytes, [4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1]);
+        assert!(MessageHead::from_slice(&bytes).unwrap().asks_for_confirmation());
+        assert!(!MessageHead::new(MessageKind::Mark, 0).asks_for_confirmation());
+        assert!(!MessageHead::new(MessageKind::Write, 1).asks_for_confirmation());
     }
 
     /// The bytes are normative.

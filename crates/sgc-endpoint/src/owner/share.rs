@@ -521,17 +521,28 @@ impl Share {
         }
     }
 
-    /// Handles a sink's request for messages. Of those published before it had the right it gets at most the history.
+    /// Handles a sink's request for messages, or its confirmation. Of messages published before it had the right it gets
+    /// at most the history.
     pub(crate) fn handle_recover(&self, cx: &mut Context, mut recover: Recover) {
         let granted = self.sinks.get(&recover.sink);
         let Some(granted) = granted.filter(|granted| granted.request.role() == Role::Subscribe) else {
             return cx.unexpected(UnexpectedFrame::Recover);
         };
+        if let Some(seq) = recover.confirmed() {
+            let (peer, Recover { name, source, .. }) = (granted.peer.node_id, recover);
+            return cx.event(Event::Confirmed { name, source, peer, seq });
+        }
         if recover.from > 0 {
             let floor = self.floor(&granted.peer.node_id, &recover.source);
             recover.from = recover.from.max(floor.unwrap_or(u64::MAX));
         }
         cx.event(Event::Recover(recover));
+    }
+
+    /// Iterates over the nodes that receive it.
+    pub(crate) fn subscribers(&self) -> impl Iterator<Item = NodeId> {
+        let subscribes = |granted: &&GrantedSink| granted.request.role() == Role::Subscribe;
+        self.sinks.values().filter(subscribes).map(|granted| granted.peer.node_id)
     }
 
     /// Returns the grant of an epoch for this request.

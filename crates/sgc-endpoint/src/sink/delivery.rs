@@ -28,6 +28,8 @@ pub enum Delivery {
     Incomplete,
     /// No message, but a sign that none is missing.
     Mark,
+    /// No message: the source asks whether this number of it and all before have arrived, which they have.
+    Confirm(SourceId, u64),
     /// No message: the publisher of this source asserted its liveliness.
     Asserted(SourceId),
     /// The sink has to ask the source for missing messages before it delivers later ones; see [`crate::Sink::ask`].

@@ -346,7 +346,12 @@ impl SourceState {
     }
 
     /// Takes a mark; each has its number. A mark ahead of an answer reports messages that are lost for good.
-    pub(super) fn take_mark(&mut self, header: &PacketHeader, text: &[u8]) -> Result<Delivery, SinkDrop> {
+    pub(super) fn take_mark(
+        &mut self,
+        header: &PacketHeader,
+        head: &MessageHead,
+        text: &[u8],
+    ) -> Result<Delivery, SinkDrop> {
         let oldest = oldest_of_mark(header, text)?;
         let in_turn = !self.recovers || header.seq == self.expected;
         if header.to.is_none() {
@@ -359,7 +364,8 @@ impl SourceState {
         }
         if in_turn {
             self.done(header.seq);
-            return Ok(Delivery::Mark);
+            let is_asked = self.recovers && head.asks_for_confirmation();
+            return Ok(if is_asked { Delivery::Confirm(header.source, header.seq) } else { Delivery::Mark });
         }
         // The mark goes ahead of an answer, and counts in its turn.
         let lost = if self.begins_anew() { 0 } else { oldest.saturating_sub(self.expected) };

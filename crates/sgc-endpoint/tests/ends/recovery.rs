@@ -276,3 +276,36 @@ fn a_floor_that_rose_is_passed_over_and_counted() {
     assert_eq!(sink.ask(source.id()), Some(7));
     assert_eq!(delivered(&mut sink, &replayed_to(&mut source, id, 7)), [7, 8, 9].map(bytes));
 }
+
+#[test]
+fn sink_confirms_when_everything_up_to_the_question_is_there() {
+    let (mut source, mut sink) = ends(100);
+    let question = |source: &mut Source| {
+        let mut packets = Vec::new();
+        source.ask_for_confirmation(|p| packets.push(p));
+        packets
+    };
+    assert!(question(&mut source).is_empty(), "nothing was published");
+    let first = published(&mut source, bytes(1), false);
+    assert_eq!(delivered(&mut sink, &first), [bytes(1)]);
+    let asked = question(&mut source);
+    assert_eq!(sink.handle_packet(&asked[0]), Ok(Delivery::Confirm(source.id(), 2)));
+    assert_eq!(sink.handle_packet(&asked[0]), Err(SinkDrop::Replayed));
+    assert_eq!(source.progress().last_message(), 1, "a question is no message");
+    // Something is missing: the sink asks for it, and confirms behind it.
+    published(&mut source, bytes(3), false);
+    let asked = question(&mut source);
+    assert_eq!(sink.handle_packet(&asked[0]), Ok(Delivery::NeedsHistory(source.id())));
+    let from = sink.ask(source.id()).unwrap();
+    let answer = replayed_to(&mut source, SINK, from);
+    let results: Vec<_> = answer.iter().map(|packet| sink.handle_packet(packet)).collect();
+    assert!(matches!(&results[0], Ok(Delivery::Message(message)) if message.seq == 3), "{results:?}");
+    assert_eq!(results[1..], [Ok(Delivery::Confirm(source.id(), 4)), Ok(Delivery::Synced(source.id()))]);
+}
+
+#[test]
+fn source_that_recovers_nothing_asks_for_no_confirmation() {
+    let mut source = unrecovered(SUITE, 5);
+    published(&mut source, bytes(1), false);
+    source.ask_for_confirmation(|packet| panic!("{:?}", packet.header));
+}

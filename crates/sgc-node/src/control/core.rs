@@ -48,6 +48,7 @@ use crate::control::fleet::reports::Reports;
 use crate::control::graph::far_consumers::FarConsumers;
 use crate::control::graph::local_graph::LocalGraph;
 use crate::control::parts::certificates::{Certificates, Validity};
+use crate::control::parts::closings::Closings;
 use crate::control::parts::forward_table::ForwardTable;
 use crate::control::parts::link_table::LinkTable;
 use crate::control::parts::network_ends::{NetworkEnds, OpenEnd};
@@ -97,6 +98,7 @@ pub(crate) struct Core<N: RosNetwork> {
     links: LinkTable,
     forwards: ForwardTable,
     shares: Shares,
+    closings: Closings,
     /// Wanted readers and writers of the local network.
     ends: NetworkEnds,
     sinks: Sinks,
@@ -130,9 +132,9 @@ pub(crate) struct Core<N: RosNetwork> {
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
     audit: Audit,
+    names: PeerNames,
     storage: StateStorage,
     board: Board,
-    names: PeerNames,
     refused: Refusals,
     /// Taps of the local network.
     local_taps: Vec<Arc<TapQueue>>,
@@ -180,10 +182,10 @@ pub(crate) struct CoreParts<N> {
     pub transport: Arc<sgc_transport::TransportMetrics>,
     /// Audit log.
     pub audit: Audit,
-    pub storage: StateStorage,
-    /// State of the searches for routers.
     /// The names of other nodes.
     pub names: PeerNames,
+    pub storage: StateStorage,
+    /// State of the searches for routers.
     pub(crate) board: Board,
     /// Keep-alive policy of new links.
     pub(crate) keep_alive_policy: KeepAlivePolicy,
@@ -228,6 +230,7 @@ impl<N: RosNetwork> Core<N> {
             links: LinkTable::new(parts.keep_alive_policy, parts.names.clone(), data.clone()),
             forwards: ForwardTable::default(),
             shares,
+            closings: Closings::default(),
             ends: NetworkEnds::default(),
             sinks: Sinks::new(requests, data),
             services,
@@ -253,10 +256,10 @@ impl<N: RosNetwork> Core<N> {
             transport: parts.transport,
             alive: parts.alive,
             audit: parts.audit,
+            names: parts.names,
             storage: parts.storage,
             board: parts.board,
             refused: Refusals::default(),
-            names: parts.names,
             types: InterfaceTypes::new(parts.types, parts.definitions),
             members,
             local_taps: Vec::new(),
@@ -400,6 +403,7 @@ impl<N: RosNetwork> Core<N> {
             SinkRequest::Synced(name, source) => {
                 self.sinks.history_arrived(name, source);
             }
+            SinkRequest::Confirm(name, source, seq) => self.endpoint.confirm(name, source, seq),
             SinkRequest::Writer(name) => {
                 if self.reopening.is_closed()
                     && let Some(sink) = self.sinks.get(&name)
@@ -422,12 +426,8 @@ impl<N: RosNetwork> Core<N> {
         self.look_at_links(now.instant);
         self.router.handle_timeout(now);
         self.endpoint.handle_timeout(now);
+        self.hold_shares(now.instant);
         if let Some(routes) = &mut self.routes {
-            for name in routes.shares_without_writers(now.instant) {
-                if self.shares.get(&name).is_some_and(|share| share.has_waiting()) {
-                    routes.hold_share(now.instant, &name);
-                }
-            }
             for (name, span) in routes.writers_in_doubt(now.instant) {
                 let last = self.sinks.get(&name).and_then(|sink| sink.last_message());
                 if let Some(last) = last.filter(|last| *last + span > now.instant) {

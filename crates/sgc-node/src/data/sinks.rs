@@ -38,6 +38,8 @@ pub(crate) enum SinkRequest {
     History(Name, SourceId),
     /// The missing messages have arrived.
     Synced(Name, SourceId),
+    /// Confirm that everything of a source up to this number has arrived.
+    Confirm(Name, SourceId, u64),
     /// A message of another publisher on our share waits for a writer.
     Writer(Name),
 }
@@ -467,6 +469,10 @@ impl LocalSink {
             }
             Ok(Delivery::NeedsHistory(source)) => {
                 let _ = self.requests.send(SinkRequest::History(self.name, source)).await;
+                Ok(())
+            }
+            Ok(Delivery::Confirm(source, seq)) => {
+                let _ = self.requests.send(SinkRequest::Confirm(self.name, source, seq)).await;
                 Ok(())
             }
             Ok(Delivery::Synced(source)) => {

@@ -65,6 +65,13 @@ pub enum Command {
         /// be gone while its last messages are still published.
         own: Vec<(Guid, SourceId, Qos)>,
     },
+    /// The last writer of a source is gone: have its last messages confirmed. The source stays for now.
+    CloseSource {
+        /// The share.
+        name: Name,
+        /// The source.
+        source: SourceId,
+    },
     /// Close the reader.
     CloseReader {
         /// The share.

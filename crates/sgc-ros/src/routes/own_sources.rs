@@ -118,6 +118,16 @@ impl OwnSources {
         })
     }
 
+    /// Returns the source of a writer.
+    pub(super) fn source_of(&self, writer: &Guid) -> Option<SourceId> {
+        Some(self.0.get(writer)?.source)
+    }
+
+    /// Returns `true` if a writer that is here has the source.
+    pub(super) fn has_writer_of(&self, source: &SourceId) -> bool {
+        self.0.values().any(|own| own.source == *source && own.gone.is_none())
+    }
+
     /// Handles the end of a writer; `is_last` if the share has no other.
     pub(super) fn writer_gone(&mut self, now: Instant, writer: &Guid, is_last: bool) {
         match self.0.get_mut(writer) {

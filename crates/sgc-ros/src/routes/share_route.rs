@@ -297,6 +297,16 @@ impl ShareRoute {
         self.own.set_alive(writer, is_alive)
     }
 
+    /// Returns the source of a writer of a topic.
+    pub(super) fn source_of(&self, writer: &Guid) -> Option<SourceId> {
+        self.own.source_of(writer)
+    }
+
+    /// Returns `true` if a writer that is here has the source.
+    pub(super) fn has_writer_of(&self, source: &SourceId) -> bool {
+        !self.writers.is_empty() && self.own.has_writer_of(source)
+    }
+
     /// Sets the history of a writer. Returns `true` if the share has to be refreshed.
     pub(super) fn set_history(&mut self, writer: &Guid, history: History) -> bool {
         let writer = self.writers.get_mut(writer);

@@ -700,6 +700,7 @@ impl Running {
                     local.retry_at = None;
                 }
             }
+            Ok(Delivery::Confirm(source, seq)) => self.endpoint.confirm(name, source, seq),
             Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Asserted(_) | Delivery::Parked) => {}
             Err(why) => self.drop_packet(name, LinkId::LOCAL, DataDrop::Sink(why)),
         }

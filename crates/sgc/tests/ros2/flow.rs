@@ -131,6 +131,26 @@ fn last_messages_of_a_publisher_that_ended_arrive_over_a_path_that_stood_still()
     }
 }
 
+/// All messages have left the robot's node when their publisher ends, and are in front of the router.
+#[test]
+fn messages_in_front_of_a_router_that_stands_still_survive_the_end_of_their_publisher() {
+    const MESSAGES: u64 = 60;
+    const PAUSE: Duration = Duration::from_secs(5);
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
+    let extra = ["--depth", "0", "--rate", "0", "--size", "65536"];
+    for pair in PAIRS {
+        let (mut talker, mut listener) = start(&lab, pair, [Site::Robot, Site::Desk], MESSAGES, "0", &extra);
+        // Between both halves, so that the second finds a window that has grown.
+        thread::sleep(Duration::from_millis(1000));
+        let router = lab.node(Site::Cloud);
+        router.signal(Signal::STOP);
+        talker.summary();
+        thread::sleep(PAUSE);
+        router.signal(Signal::CONT);
+        assert_whole(&listener.summary(), MESSAGES, &format!("{pair:?}"));
+    }
+}
+
 #[test]
 fn large_messages_of_real_ros_2_arrive_whole() {
     const MESSAGES: u64 = 10;

@@ -142,6 +142,9 @@ impl<N: RosNetwork> Core<N> {
                     self.control_drops.count(NodeDrop::ReplaysFull);
                 }
             }
+            Event::Confirmed { name, source, peer, seq } => {
+                self.closings.confirmed(&name, &source, &peer, seq);
+            }
             Event::Granted { name, sink, grant } => {
                 debug!(name = %name.short(), epoch = grant.epoch, "granted");
                 let entry = grant.entry.as_deref().cloned();
@@ -182,6 +185,7 @@ impl<N: RosNetwork> Core<N> {
             Event::SinkLeft { name, sink, peer } => {
                 debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
                 routes.handle_sink_left(now.instant, &name, &sink);
+                self.closings.lost_path(now.instant, name, peer);
                 self.consumers.sink_left(peer, name, sink, now.instant + UNREACHABLE_HOLD);
             }
             Event::SinkCut { name, sink, peer, reason } => {
@@ -193,6 +197,7 @@ impl<N: RosNetwork> Core<N> {
                 debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
                 self.refused.remember(name, peer, &reason);
                 routes.handle_sink_left(now.instant, &name, &sink);
+                self.closings.cut(&name, &peer);
                 self.consumers.sink_left(peer, name, sink, now.instant);
             }
             Event::SinkRefused { name, peer, reason } => {
@@ -241,6 +246,7 @@ impl<N: RosNetwork> Core<N> {
             | Event::Rekeyed { .. }
             | Event::OwnGrant { .. }
             | Event::Recover(_)
+            | Event::Confirmed { .. }
             | Event::Types { .. }
             | Event::Consumers { .. }
             | Event::ConsumersLost { .. }

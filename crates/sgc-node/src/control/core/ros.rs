@@ -46,6 +46,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Command::Unshare { name } => self.unshare(now, name),
             Command::MapSources { name, class, own } => self.map_sources(name, class, own),
+            Command::CloseSource { name, source } => self.close_source(now.instant, name, source),
             Command::OpenReader { name, spec } => self.open_reader(name, spec),
             Command::CloseReader { name } => self.close_reader(&name),
             Command::UpdatePolicy { name, policy } => self.endpoint.update_policy(now, &name, policy),
@@ -136,8 +137,49 @@ impl<N: RosNetwork> Core<N> {
         self.consumers.show_soon(now.instant);
         self.forget_type(&name);
         self.shares.remove(&name);
+        self.closings.retain(&name, |_| false);
         self.end_calls(&name);
         self.sinks.remove(&name);
+    }
+
+    /// Asks the sinks of a source whose publisher is gone to confirm its last message.
+    fn close_source(&mut self, now: Instant, name: Name, source: SourceId) {
+        let Some(share) = self.shares.get(&name) else { return };
+        let Some(last) = share.last_to_confirm(&source) else { return };
+        self.closings.begin(now, name, source, last, self.endpoint.subscribers(&name));
+        if self.closings.unconfirmed(now, &name).any(|waiting| waiting == source) {
+            share.ask_for_confirmation(&source);
+        }
+    }
+
+    /// Holds the shares of writers that are gone while messages of theirs wait here, or nodes have not confirmed the
+    /// last ones.
+    pub(super) fn hold_shares(&mut self, now: Instant) {
+        let Some(routes) = &self.routes else { return };
+        for name in routes.shares_without_writers(now) {
+            if (self.has_waiting(&name) || self.awaits_confirmation(now, name))
+                && let Some(routes) = &mut self.routes
+            {
+                routes.hold_share(now, &name);
+            }
+        }
+    }
+
+    /// Returns `true` if messages of local publishers wait here.
+    fn has_waiting(&self, name: &Name) -> bool {
+        self.shares.get(name).is_some_and(|share| share.has_waiting())
+    }
+
+    /// Returns `true` if the last messages of a publisher that is gone are not confirmed, and asks once more.
+    fn awaits_confirmation(&mut self, now: Instant, name: Name) -> bool {
+        let Some(routes) = &self.routes else { return false };
+        // Another publisher may have taken a source over.
+        self.closings.retain(&name, |source| !routes.has_writer_of(&name, source));
+        // Messages may have come since the writer went, and a question may have been lost with a link.
+        for source in self.closings.of(&name).collect::<Vec<_>>() {
+            self.close_source(now, name, source);
+        }
+        self.closings.unconfirmed(now, &name).next().is_some()
     }
 
     fn leave(&mut self, now: Now, name: Name) {
@@ -285,6 +327,7 @@ impl<N: RosNetwork> Core<N> {
             });
         }
         let sources: BTreeMap<_, _> = map.slots().map(|s| (s.id, s.progress.clone())).collect();
+        self.closings.retain(&name, |source| sources.contains_key(source));
         self.endpoint.set_sources(now(), &name, sources.into_values().collect());
         self.set_map(&share, map);
     }

@@ -14,6 +14,7 @@
 //! [`forward_table`] and [`network_ends`] only keep entries.
 
 pub(crate) mod certificates;
+pub(crate) mod closings;
 pub(crate) mod forward_table;
 pub(crate) mod link_table;
 pub(crate) mod network_ends;

@@ -14,7 +14,7 @@ use bytes::Bytes;
 use sgc_endpoint::Source;
 use sgc_ros::{Guid, Sample, SampleKind, Shaping};
 use sgc_sync::lock;
-use sgc_wire::{MessageHead, MessageKind, Name, Recover, SinkId, TopicGrant};
+use sgc_wire::{MessageHead, MessageKind, Name, Recover, SinkId, SourceId, TopicGrant};
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
 
@@ -360,6 +360,24 @@ impl LocalShare {
         self.runtime.spawn_blocking(move || {
             let _alive = alive;
             work();
+        });
+    }
+
+    /// Returns the last message of a source, if its sinks could ask for it again and so can confirm it.
+    pub(crate) fn last_to_confirm(&self, source: &SourceId) -> Option<u64> {
+        let progress = self.map.load().slot(source)?.progress;
+        Some(progress.last_message()).filter(|last| progress.recovers() && *last > 0)
+    }
+
+    /// Asks the sinks of a source to confirm that they have everything, if there is a path to any.
+    pub(crate) fn ask_for_confirmation(self: &Arc<Self>, source: &SourceId) {
+        let Some(slot) = self.map.load().slot(source).filter(|_| self.emit.is_wanted()) else { return };
+        let share = self.clone();
+        self.run_blocking(move || {
+            // The holder of the source is about to publish, and the question is repeated.
+            if let Ok(mut source) = slot.source.try_lock() {
+                source.ask_for_confirmation(share.emit.packets());
+            }
         });
     }
 

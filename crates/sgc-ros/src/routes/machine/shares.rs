@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use rand_core::RngCore;
 use sgc_trust::derive_name;
-use sgc_wire::{Kind, Name, SinkId};
+use sgc_wire::{Kind, Name, SinkId, SourceId};
 
 use super::Routes;
 use crate::names::{is_topic_name, ros_type};
@@ -121,7 +121,12 @@ impl<R: RngCore> Routes<R> {
         for name in with.map(ShareRoute::name).collect::<Vec<_>>() {
             let Some(share) = self.shares.get_mut(&name) else { continue };
             let rule = &self.share_rules[share.rule()];
-            match share.remove_writer(now, &endpoint.guid, rule) {
+            let source = share.source_of(&endpoint.guid).filter(|_| !rule.is_service());
+            let removal = share.remove_writer(now, &endpoint.guid, rule);
+            if let Some(source) = source.filter(|source| !share.has_writer_of(source)) {
+                self.commands.push_back(Command::CloseSource { name, source });
+            }
+            match removal {
                 Some(WriterRemoval::Changed) => self.refresh_share(name),
                 Some(WriterRemoval::Held) if rule.is_service() => {
                     self.commands.push_back(Command::ServersGone { name });
@@ -173,6 +178,11 @@ impl<R: RngCore> Routes<R> {
     pub fn shares_without_writers(&self, now: Instant) -> Vec<Name> {
         let due = self.shares.values().filter(|share| share.outlives_writers(now));
         due.map(ShareRoute::name).collect()
+    }
+
+    /// Returns `true` if a local writer that is here has a source of a share.
+    pub fn has_writer_of(&self, name: &Name, source: &SourceId) -> bool {
+        self.shares.get(name).is_some_and(|share| share.has_writer_of(source))
     }
 
     /// Keeps a share and its sources for a while longer, within bounds, because messages of its writers wait to be
