@@ -46,7 +46,12 @@ try {
   assert.equal(await page.locator("#topics tr").count(), 500);
   await page.fill("#filter", "topic_499");
   await page.locator("#shown", { hasText: "1 of 500" }).waitFor(PATIENCE);
-  assert.match(await page.locator("#topics tr").textContent(), /share\/topic_499.*waits for a local publisher/);
+  // Its path, rate, messages, age, drops and state.
+  const cells = await page.locator("#topics tr td").allTextContents();
+  assert.deepEqual([...cells.slice(0, 2), ...cells.slice(4, 9)], ["share", "/topic_499", "–", "0.0", "0", "–", "–"]);
+  assert.match(cells[9], /waits for a local publisher/);
+  const link = await page.locator("#links tr td").allTextContents();
+  assert.match(link.join("|"), /^router\|a router\|[0-9.]+ ms\|(–|[0-9.]+ %)\|this node$/);
 
   begin("why");
   await page.locator("#topics button").click();

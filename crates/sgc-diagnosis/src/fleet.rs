@@ -3,6 +3,7 @@
 //! Reports come from other machines. Callers remove control characters from the lines (`Line::cleaned`) before they print
 //! them.
 
+use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::time::Duration;
@@ -238,7 +239,7 @@ impl FleetStatus {
             }
         };
         let links = report.links.iter().map(|link| self.link_row(link)).collect();
-        section("Links", &["to", "by", "round trip", "dialled by"], links, report.links_omitted);
+        section("Links", &["to", "by", "round trip", "lost", "dialled by"], links, report.links_omitted);
         if !report.routers.is_empty() {
             let rows = report.routers.iter().map(|router| {
                 let failure = router.last_failure.clone().unwrap_or_default();
@@ -246,8 +247,8 @@ impl FleetStatus {
             });
             section("Routers", &["router", "state", "last failure"], rows.collect(), 0);
         }
-        let topics = report.topics.iter().map(topic_row).collect();
-        let head = ["", "topic", "type", "owner", "messages", "state"];
+        let topics = report.topics.iter().map(|topic| self.topic_row(topic)).collect();
+        let head = ["", "topic", "type", "owner", "path", "messages", "age", "dropped", "state"];
         section("Topics", &head, topics, report.topics_omitted);
         if let Some(rights) = &report.rights {
             let recipients = self.recipients();
@@ -366,14 +367,36 @@ impl FleetStatus {
             self.name_of(link),
             if self.is_router(&link.peer) { "a router" } else { "itself" }.to_owned(),
             if link.silent { "silent".to_owned() } else { output::millis(link.rtt_us) },
+            lost(link),
             if link.dialled { "this node" } else { "the other" }.to_owned(),
+        ]
+    }
+
+    fn topic_row(&self, topic: &ReportTopic) -> Vec<String> {
+        vec![
+            topic.direction.clone(),
+            topic.topic.clone(),
+            topic.type_name.clone().unwrap_or_else(|| "?".into()),
+            topic.owner.clone(),
+            match &topic.via {
+                None => "–".to_owned(),
+                Some(_) if topic.direct => "direct".to_owned(),
+                Some(via) => format!("over {}", self.known_name(via).unwrap_or_else(|| beginning(via))),
+            },
+            topic.messages.to_string(),
+            age(topic),
+            dropped(topic),
+            topic.state.clone(),
         ]
     }
 
     /// Returns the name of the node at the other end of a link, or the beginning of its id.
     fn name_of(&self, link: &ReportLink) -> String {
-        let known = self.known.get(&link.peer).map(|(name, _)| name.clone());
-        known.or_else(|| link.name.clone()).unwrap_or_else(|| link.peer.chars().take(8).collect())
+        self.known_name(&link.peer).or_else(|| link.name.clone()).unwrap_or_else(|| beginning(&link.peer))
+    }
+
+    fn known_name(&self, id: &str) -> Option<String> {
+        self.known.get(id).map(|(name, _)| name.clone())
     }
 
     /// Returns `true` if a node is known to route for others.
@@ -501,15 +524,42 @@ fn listed(names: &[String]) -> String {
     }
 }
 
-fn topic_row(topic: &ReportTopic) -> Vec<String> {
-    vec![
-        topic.direction.clone(),
-        topic.topic.clone(),
-        topic.type_name.clone().unwrap_or_else(|| "?".into()),
-        topic.owner.clone(),
-        topic.messages.to_string(),
-        topic.state.clone(),
-    ]
+/// Returns the beginning of a node id, by which nodes without a name are called.
+fn beginning(id: &str) -> String {
+    id.chars().take(8).collect()
+}
+
+/// Returns the part of a link's packets that was lost.
+fn lost(link: &ReportLink) -> String {
+    match (link.lost_packets, link.sent_packets) {
+        (0, _) | (_, 0) => "–".to_owned(),
+        (lost, sent) => format!("{:.1} %", 100.0 * lost as f64 / sent as f64),
+    }
+}
+
+/// Returns the time from the publication of a topic's last message to its arrival. Clocks that differ make it negative.
+fn age(topic: &ReportTopic) -> String {
+    topic.age_us.map_or_else(
+        || "–".to_owned(),
+        |age_us| {
+            let sign = if age_us < 0 { "-" } else { "" };
+            format!("{sign}{}", output::millis(age_us.unsigned_abs()))
+        },
+    )
+}
+
+/// Returns the drops of a topic with their reasons, the most first.
+fn dropped(topic: &ReportTopic) -> String {
+    let mut drops: Vec<_> = topic.drops.iter().collect();
+    drops.sort_by_key(|(_, n)| Reverse(**n));
+    let mut drops = drops.into_iter().map(|(reason, n)| format!("{n} {reason}"));
+    drops.next().map_or_else(
+        || "–".to_owned(),
+        |most| match drops.count() {
+            0 => most,
+            more => format!("{most} and {more} more"),
+        },
+    )
 }
 
 #[cfg(test)]
@@ -521,6 +571,11 @@ mod tests {
 
     fn plain(lines: &[Line]) -> Vec<String> {
         lines.iter().map(ToString::to_string).collect()
+    }
+
+    /// Returns the words of a line, one space apart.
+    fn words(line: &str) -> String {
+        line.split_whitespace().collect::<Vec<_>>().join(" ")
     }
 
     const NOW: u64 = 1_795_000_000_000;
@@ -738,6 +793,41 @@ mod tests {
         fleet.members_omitted = 1;
         let lines = plain(&fleet.details(&fleet.nodes[0])).join("\n");
         assert!(lines.contains("ghost (it is not among the members that are known here)"), "{lines}");
+    }
+
+    #[test]
+    fn details_have_the_path_age_and_drops_of_topics_and_the_losses_of_links() {
+        let mut arm = report("arm", &[("11", 23_000), ("22", 500)]);
+        (arm.links[0].sent_packets, arm.links[0].lost_packets) = (2000, 31);
+        let brought = |topic: &str| ReportTopic {
+            direction: "use".into(),
+            topic: topic.into(),
+            type_name: Some("x_msgs/msg/Y".into()),
+            owner: "desk".into(),
+            messages: 7,
+            via: Some("11".into()),
+            age_us: Some(12_345),
+            state: "granted".into(),
+            ..ReportTopic::default()
+        };
+        arm.topics.push(ReportTopic {
+            drops: [("stale".to_owned(), 3), ("no_writer".to_owned(), 40)].into(),
+            ..brought("/a")
+        });
+        arm.topics.push(ReportTopic { direct: true, age_us: Some(-2000), ..brought("/b") });
+        arm.topics.push(ReportTopic { via: Some("0123456789".into()), age_us: None, ..brought("/c") });
+        let fleet = fleet(vec![answer_of(arm)]);
+        let node = fleet.nodes.iter().find(|node| node.name == "arm").unwrap();
+        let lines = plain(&fleet.details(node)).into_iter().map(|line| words(&line)).collect::<Vec<_>>();
+        for line in [
+            "cloud a router 23 ms 1.6 % the other",
+            "use /a x_msgs/msg/Y desk over cloud 7 12 ms 40 no_writer and 1 more granted",
+            "use /b x_msgs/msg/Y desk direct 7 -2.00 ms – granted",
+            "use /c x_msgs/msg/Y desk over 01234567 7 – – granted",
+            "share /odom ? – 500 – – granted",
+        ] {
+            assert!(lines.iter().any(|found| found == line), "{line:?} is not in {lines:#?}");
+        }
     }
 
     #[test]

@@ -367,6 +367,11 @@ impl Endpoint {
         self.owner.subscribers(name)
     }
 
+    /// Returns the owner of a name that this node has joined.
+    pub fn owner_of(&self, name: &Name) -> Option<NodeId> {
+        self.joiner.owner_of(name)
+    }
+
     /// Returns the status of a join.
     pub fn join_status(&self, name: &Name) -> Option<JoinStatus> {
         self.joiner.status(name)

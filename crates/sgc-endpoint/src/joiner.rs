@@ -152,6 +152,11 @@ impl Joiner {
         }
     }
 
+    /// Returns the owner of a joined name.
+    pub(crate) fn owner_of(&self, name: &Name) -> Option<NodeId> {
+        self.joins.get(name).map(Join::owner)
+    }
+
     /// Returns the status of a join.
     pub(crate) fn status(&self, name: &Name) -> Option<JoinStatus> {
         self.joins.get(name).map(Join::status)

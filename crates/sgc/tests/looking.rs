@@ -103,6 +103,14 @@ impl Lab {
         });
     }
 
+    /// Returns a node's report of itself.
+    fn report(&self, node: &str) -> Value {
+        let output = self.sgc(&["fleet", "status", node, "--json", "--socket", &format!("{node}.sock")]);
+        let status: Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{output:?}"));
+        status["nodes"].as_array().unwrap().iter().find(|found| found["name"] == node).unwrap()["report"]
+            .clone()
+    }
+
     fn topic(&self, node: &str, args: &[&str]) -> Output {
         let socket = format!("{node}.sock");
         self.sgc(&[&["topic"], args, &["--socket", &socket]].concat())
@@ -116,6 +124,12 @@ impl Drop for Lab {
             ["robot", "cloud", "desk"].into_iter().for_each(|node| say_log(node, &self.log(node)));
         }
     }
+}
+
+/// Returns a topic of a report.
+fn topic_of(report: &Value, topic: &str) -> Value {
+    let found = report["topics"].as_array().unwrap().iter().find(|found| found["topic"] == topic);
+    found.unwrap_or_else(|| panic!("{topic} is not in {report}")).clone()
 }
 
 #[test]
@@ -155,6 +169,21 @@ fn messages_are_shown_at_both_ends_and_missing_parts_are_named() {
     listener.wait("a match", |event| event["event"] == "matched");
     lab.finds("desk", &["/chatter"], "");
     lab.finds("robot", &["/chatter"], "");
+
+    // The report has the path of the topic and the age of its last message; one of an own topic has neither.
+    let report = lab.report("desk");
+    let topic = topic_of(&report, "/chatter");
+    assert_eq!(
+        (&topic["via"], &topic["direct"]),
+        (&report["links"][0]["peer"], &Value::from(false)),
+        "{topic}"
+    );
+    assert!(topic["path_us"].as_u64() > Some(0) && topic["drops"].is_object(), "{topic}");
+    let age_us = topic["age_us"].as_i64().unwrap_or_else(|| panic!("{topic}"));
+    assert!((0..60_000_000).contains(&age_us), "{topic}");
+    assert!(report["links"][0]["sent_packets"].as_u64() > Some(0), "{report}");
+    let topic = topic_of(&lab.report("robot"), "/chatter");
+    assert_eq!(["via", "path_us", "age_us"].map(|key| topic[key].is_null()), [true; 3], "{topic}");
 
     // A service has a server there and none here.
     lab.finds("robot", &["/add_two_ints"], "no server of /add_two_ints is on the local network");

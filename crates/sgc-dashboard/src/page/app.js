@@ -140,7 +140,8 @@ const timeText = (ms, length) => {
 const millis = (us) => (us < 10_000 ? `${(us / 1000).toFixed(2)} ms` : `${Math.round(us / 1000)} ms`);
 const count = (n) => n.toLocaleString("en");
 
-const nameOf = (link) => view.known[link.peer]?.[0] ?? link.name ?? link.peer.slice(0, 8);
+const nameOfId = (id) => view.known[id]?.[0] ?? id.slice(0, 8);
+const nameOf = (link) => view.known[link.peer]?.[0] ?? link.name ?? nameOfId(link.peer);
 const isRouter = (id) => view.known[id]?.[1] ?? false;
 const idOf = (node) => node.member?.id;
 const nodes = () => view.fleet.nodes;
@@ -180,6 +181,19 @@ const linksText = (report) => {
   if (more > 0) shown.push(`${more} more`);
   return shown.join(", ") || "none";
 };
+
+/** The part of a link's packets that was lost; reports of earlier versions have no counts. */
+const lostOf = ({ sent_packets, lost_packets }) =>
+  sent_packets && lost_packets ? `${((100 * lost_packets) / sent_packets).toFixed(1)} %` : "–";
+
+/** The path of a topic from its owner. */
+const pathOf = ({ via, direct }) => (!via ? "–" : direct ? "direct" : `over ${nameOfId(via)}`);
+
+/** The drops of a topic with their reasons, the most first. */
+const dropsOf = (topic) => Object.entries(topic.drops ?? {}).sort(([, a], [, b]) => b - a);
+const droppedOf = (topic) => dropsOf(topic).map(([reason, n]) => `${count(n)} ${reason}`).join(", ") || "–";
+const meaningsOf = (topic) =>
+  dropsOf(topic).map(([reason]) => `${reason}: ${view.meanings[reason] ?? "–"}`).join("\n");
 
 const topicKey = (topic) => `${topic.direction} ${topic.topic} ${topic.owner} ${topic.type ?? ""}`;
 
@@ -306,7 +320,8 @@ const showMap = () => {
       const key = [member.id, link.peer].sort().join("-");
       const known = lines.get(key);
       const silent = link.silent || (known?.silent ?? false);
-      lines.set(key, { key, from: member.id, to: link.peer, rtt_us: link.rtt_us, silent });
+      const lost = [known?.lost, lostOf(link)].filter((part) => part && part !== "–");
+      lines.set(key, { key, from: member.id, to: link.peer, rtt_us: link.rtt_us, silent, lost: lost[0] });
     }
   }
   const map = by("map");
@@ -321,14 +336,15 @@ const showMap = () => {
       line.append(svg("title"));
       return line;
     },
-    (element, { from, to, rtt_us, silent }) => {
+    (element, { from, to, rtt_us, silent, lost }) => {
       const [a, b] = [at.get(from), at.get(to)];
       for (const [name, value] of [["x1", a.x], ["y1", a.y], ["x2", b.x], ["y2", b.y]]) {
         setAttribute(element, name, value.toFixed(1));
       }
       const direct = !isRouter(from) && !isRouter(to);
       setAttribute(element, "class", [direct && "direct", silent && "silent"].filter(Boolean).join(" "));
-      setText(element.firstElementChild, `${a.node.name} – ${b.node.name}: ${silent ? "silent" : millis(rtt_us)}`);
+      const state = silent ? "silent" : `${millis(rtt_us)}${lost ? `, ${lost} lost` : ""}`;
+      setText(element.firstElementChild, `${a.node.name} – ${b.node.name}: ${state}`);
     },
   );
   sync(
@@ -491,6 +507,7 @@ const showDetails = () => {
     { text: nameOf },
     { text: (link) => (isRouter(link.peer) ? "a router" : "itself") },
     { number: true, text: (link) => (link.silent ? "silent" : millis(link.rtt_us)) },
+    { number: true, text: lostOf },
     { text: (link) => (link.dialled ? "this node" : "the other") },
   ]);
   syncRows(by("routers"), report?.routers ?? [], (router) => router.router, [
@@ -507,13 +524,17 @@ const showDetails = () => {
     { text: (topic) => topic.topic },
     { text: (topic) => topic.type ?? "?" },
     { text: (topic) => topic.owner },
+    { text: pathOf },
     { number: true, text: (topic) => rateOf(node, topic) },
     { number: true, text: (topic) => count(topic.messages) },
+    { number: true, text: (topic) => (Number.isInteger(topic.age_us) ? millis(topic.age_us) : "–") },
+    { make: () => document.createElement("span"), text: droppedOf },
     { make: () => document.createElement("span"), text: (topic) => topic.state },
     { make: (topic) => button("why?", () => explain(node.name, topic.topic)) },
   ]);
   topics.forEach((topic, at) => {
-    setAttribute(by("topics").rows[at].cells[6].firstElementChild, "class", topic.stuck ? "fault" : "");
+    setAttribute(by("topics").rows[at].cells[9].firstElementChild, "class", topic.stuck ? "fault" : "");
+    setAttribute(by("topics").rows[at].cells[8].firstElementChild, "title", meaningsOf(topic));
   });
   syncRows(by("drops"), Object.entries(report?.drops ?? {}), ([reason]) => reason, [
     { text: ([reason]) => reason },

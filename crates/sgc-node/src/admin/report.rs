@@ -145,6 +145,10 @@ pub struct ReportLink {
     pub silent: bool,
     /// `true` if the reporting node dialled.
     pub dialled: bool,
+    /// The number of packets of the transport that were sent.
+    pub sent_packets: u64,
+    /// The number of these that were lost. Except for datagrams, their content was sent again.
+    pub lost_packets: u64,
 }
 
 /// A search for a router of a reporting node.
@@ -180,6 +184,17 @@ pub struct ReportTopic {
     pub waiting: bool,
     /// The number of messages that were published or delivered.
     pub messages: u64,
+    /// The time from the publication of the last message until it arrived here, microseconds, by the clocks of both
+    /// hosts; null if the topic is the node's own, or nothing came.
+    pub age_us: Option<i64>,
+    /// The node id of the next node on the path to the owner; null if the topic is the node's own, or there is no path.
+    pub via: Option<String>,
+    /// `true` if that is the owner itself.
+    pub direct: bool,
+    /// The round-trip time of that path, microseconds, as routing adds it up; null without one.
+    pub path_us: Option<u64>,
+    /// Counts of its packets and messages that the node dropped, by reason.
+    pub drops: BTreeMap<String, u64>,
 }
 
 /// The rights that a node's configuration gives. A recipient is a node (`"desk"`), a group (`"group:operators"`), every

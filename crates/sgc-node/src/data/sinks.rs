@@ -4,7 +4,7 @@
 //! writer ([`crate::data::writer_queue`]).
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -13,11 +13,12 @@ use sgc_endpoint::{AskAgain, Delivery, Message, Receivers, Sink, SinkDrop, SinkL
 use sgc_ros::Shaping;
 use sgc_router::LinkId;
 use sgc_sync::lock;
-use sgc_wire::{MessageKind, Name, Packet, PayloadForm, SinkId, SourceId, TopicGrant};
+use sgc_wire::{MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId, SourceId, TopicGrant};
 use tokio::sync::{OwnedMutexGuard, mpsc};
 use tokio::time::timeout_at;
 use tracing::{debug, warn};
 
+use crate::clock::unix_ns;
 use crate::data::conversion::{KnownType, TypeSlot};
 use crate::data::pending::{PendingBytes, PendingQueue};
 use crate::data::stats::{CountDrops, DataDrop, Dropped, Drops};
@@ -30,6 +31,8 @@ const LAST_WRITES_MAX: Duration = Duration::from_secs(1);
 
 /// Shortest time between two requests of a sink for a writer.
 const ASK_WRITER_EVERY: Duration = Duration::from_secs(1);
+/// Age of the last message before there is one.
+const NO_AGE: i64 = i64::MIN;
 
 /// Request of a sink to the control task.
 #[derive(Clone, Copy, Debug)]
@@ -72,6 +75,8 @@ pub(crate) struct LocalSink {
     writers: ArcSwap<BTreeMap<Option<SourceId>, Arc<WriterQueue>>>,
     requests: mpsc::Sender<SinkRequest>,
     delivered: AtomicU64,
+    /// Nanoseconds from the publication of the last message to its arrival, [`NO_AGE`] before the first.
+    age_ns: AtomicI64,
     shaping: Mutex<Shaping>,
     taps: Taps,
     frames: FramePrefix,
@@ -102,6 +107,7 @@ impl LocalSink {
             writers: ArcSwap::default(),
             requests,
             delivered: AtomicU64::new(0),
+            age_ns: AtomicI64::new(NO_AGE),
             shaping: Mutex::default(),
             taps: Taps::default(),
             frames: FramePrefix::default(),
@@ -144,6 +150,20 @@ impl LocalSink {
     pub(crate) fn since_last(&self) -> Option<Duration> {
         let last = self.writers.load().values().filter_map(|writer| writer.last_written()).max();
         last.map(|last| last.elapsed())
+    }
+
+    /// Returns the time from the publication of the last message to its arrival, nanoseconds by the clocks of both
+    /// hosts: less than 0 if the publisher's is ahead.
+    pub(crate) fn last_age_ns(&self) -> Option<i64> {
+        Some(self.age_ns.load(Relaxed)).filter(|age| *age != NO_AGE)
+    }
+
+    /// Notes that a message was handed to its writer.
+    fn note_delivered(&self, head: &MessageHead) {
+        self.delivered.fetch_add(1, Relaxed);
+        if head.source_timestamp_ns > 0 {
+            self.age_ns.store(unix_ns().saturating_sub(head.source_timestamp_ns), Relaxed);
+        }
     }
 
     /// Sets where the keys of callers are, for the sink of our own service.
@@ -502,7 +522,7 @@ impl LocalSink {
             Handover::Full(message) => message,
         };
         let Some(writer) = self.writer(&message.source) else { return Err(Dropped::one(DataDrop::NoWriter)) };
-        self.delivered.fetch_add(1, Relaxed);
+        self.note_delivered(&message.head);
         self.taps.offer(|| self.tapped(&message));
         writer.push(message).await.map_err(|_| Dropped::one(DataDrop::Stalled))
     }
@@ -546,7 +566,7 @@ impl LocalSink {
             WriteOutcome::Taken { evicted } => evicted,
             WriteOutcome::Full(message) => return Handover::Full(message),
         };
-        self.delivered.fetch_add(1, Relaxed);
+        self.note_delivered(&head);
         if let Some(tapped) = tapped {
             self.taps.offer(|| tapped);
         }

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use sgc_endpoint::{JoinStatus, RefusedBy, pack_report, unpack_report};
 use sgc_ros::{RosNetwork, RouteState, RouteStatus, Routes};
 use sgc_trust::{Grantees, VerifiedPeer};
-use sgc_wire::{Decode as _, Name, RefuseReason, Report, ReportQuestion, SinkId};
+use sgc_wire::{Decode as _, Name, NodeId, RefuseReason, Report, ReportQuestion, SinkId};
 use tokio::sync::oneshot;
 use tracing::warn;
 
@@ -19,9 +19,19 @@ use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::fleet::authority::Authority;
 use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryTarget};
+use crate::control::parts::link_table::LinkEntry;
 use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
 use crate::state::credentials::lasts;
+
+/// The path to the owner of an interface.
+struct PathToOwner {
+    /// The next node.
+    via: NodeId,
+    is_direct: bool,
+    /// Its round-trip time, microseconds.
+    cost_us: u64,
+}
 
 /// Reports of this node.
 impl<N: RosNetwork> Core<N> {
@@ -117,6 +127,14 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
+    /// Returns the path to the owner of another node's interface.
+    fn path_to_owner(&self, name: &Name) -> Option<PathToOwner> {
+        let owner = self.endpoint.owner_of(name)?;
+        let (link, cost_us) = self.router.route(name)?;
+        let via = self.links.get(link)?.peer().node_id;
+        Some(PathToOwner { via, is_direct: via == owner, cost_us: cost_us.into() })
+    }
+
     fn node_report(&self) -> NodeReport {
         let identity = self.certificates.identity();
         let mut alerts = self.alerts();
@@ -130,6 +148,11 @@ impl<N: RosNetwork> Core<N> {
                 route.state,
                 RouteState::Owner(_) | RouteState::NotListed { is_pattern: false } | RouteState::Refused(_)
             );
+            let sink = route.name.and_then(|name| self.sinks.get(&name));
+            let path = route.name.and_then(|name| self.path_to_owner(&name));
+            let age_us = sink.and_then(|sink| sink.last_age_ns()).map(|age_ns| age_ns / 1000);
+            let forwarded = route.name.and_then(|name| self.forwards.get(&name));
+            let drops = forwarded.map(|(_, stats)| stats.reasons()).unwrap_or_default();
             let line = self.route_line(route);
             ReportTopic {
                 direction: line.direction.to_owned(),
@@ -140,16 +163,23 @@ impl<N: RosNetwork> Core<N> {
                 stuck,
                 waiting,
                 messages: line.messages,
+                age_us,
+                direct: path.as_ref().is_some_and(|path| path.is_direct),
+                path_us: path.as_ref().map(|path| path.cost_us),
+                via: path.map(|path| path.via.to_string()),
+                drops,
             }
         };
         let mut topics = self.routes.iter().flat_map(Routes::status);
         let shown = topics.by_ref().take(REPORT_TOPICS_MAX).map(topic).collect();
-        let link = |(id, entry): (_, &crate::control::parts::link_table::LinkEntry)| {
-            let peer = entry.peer().node_id;
+        let link = |(id, entry): (_, &LinkEntry)| {
+            let (peer, stats) = (entry.peer().node_id, entry.stats());
             ReportLink {
                 peer: peer.to_string(),
                 name: self.names.get(&peer),
-                rtt_us: entry.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
+                rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
+                sent_packets: stats.sent_packets,
+                lost_packets: stats.lost_packets,
                 silent: self.router.link_cost(id).is_some_and(|(_, is_silent)| is_silent),
                 dialled: entry.url().is_some(),
             }
