@@ -44,6 +44,10 @@ impl Context {
         self.anchors = anchors;
     }
 
+    pub(crate) fn limits_mut(&mut self) -> &mut Limits {
+        &mut self.limits
+    }
+
     pub(crate) fn limits(&self) -> &Limits {
         &self.limits
     }

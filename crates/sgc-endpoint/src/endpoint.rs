@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
@@ -174,6 +175,13 @@ impl Endpoint {
     pub fn unshare(&mut self, now: Now, name: &Name) {
         self.cx.set_now(now);
         self.owner.unshare(&mut self.cx, name);
+    }
+
+    /// Sets the longest time of an epoch, for those that have begun, too.
+    pub fn set_rotate_every(&mut self, now: Now, every: Duration) {
+        self.cx.set_now(now);
+        self.cx.limits_mut().rotate_every = every;
+        self.owner.end_epochs_by(now.instant + every);
     }
 
     /// Begins a new epoch of a share.

@@ -170,6 +170,11 @@ impl Owner {
         self.shares.get(name).into_iter().flat_map(Share::subscribers)
     }
 
+    /// Ends the epochs of all shares at a time, unless they end before.
+    pub(crate) fn end_epochs_by(&mut self, at: Instant) {
+        self.shares.end_epochs_by(at);
+    }
+
     /// Begins a new epoch of a share.
     pub(crate) fn rotate(&mut self, cx: &mut Context, name: &Name) {
         if let Some(share) = self.shares.get_mut(name) {

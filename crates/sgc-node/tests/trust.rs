@@ -537,6 +537,24 @@ fn non_operator_changes_nothing() {
     };
     assert!(lab.audit("keeper").iter().any(refused));
     assert_eq!(lab.certificates("mine"), 0);
+
+    // A reload makes it an operator, and takes that back.
+    let set = |operators: &[&str]| {
+        let operators = operators.iter().map(|node| Recipient::Node(node.parse().unwrap())).collect();
+        let report = keeper.reload(|c| c.authority.as_mut().unwrap().operators = operators);
+        assert_eq!(
+            report["changed"],
+            serde_json::json!(["who may change the fleet here changed"]),
+            "{report}"
+        );
+        assert_eq!(report["needs_restart"], serde_json::json!([]));
+    };
+    set(&["guest"]);
+    let listed = operate(&guest, "keeper", Operation::List { after: None });
+    assert!(matches!(listed, Ok(OperationAnswer::Roster(_))), "{listed:?}");
+    set(&[]);
+    let said = operate(&guest, "keeper", Operation::List { after: None }).unwrap_err();
+    assert!(said.starts_with("keeper does not take this node for an operator"), "{said}");
     drop(keeper);
 
     // Without operators, an authority answers the invited alone.

@@ -334,6 +334,48 @@ fn a_running_node_takes_what_it_can_and_names_what_needs_a_restart() {
 }
 
 #[test]
+fn audit_log_rotation_and_peer_rate_change_at_a_reload() {
+    let place = Place::new();
+    let base = place.read("arm-1.toml");
+    let node = place.start("arm-1.toml");
+    let reload = |more: &str| {
+        place.write("arm-1.toml", &format!("{base}\n{more}"));
+        place.run(&["reload", "--socket", "arm.sock"])
+    };
+    let changed = |more: &str, lines: &[&str]| {
+        let said = reload(more);
+        assert_eq!((said.code, said.stdout.lines().collect::<Vec<_>>()), (Some(0), lines.to_vec()));
+    };
+    let rotation = "[rotation]\nevery = \"20s\"\nmessages = 2048\n";
+    changed(rotation, &["topics get a new key after 20 s or 2048 messages"]);
+    let moved = format!("{rotation}[audit]\nfile = \"elsewhere.jsonl\"\n");
+    changed(&moved, &["the audit log is elsewhere.jsonl, at most 9 files of 16777216 bytes"]);
+    let reloads = |file: &str| place.read(file).lines().filter(|line| line.contains("\"reload\"")).count();
+    let wait = |file: &str, n: usize| {
+        let deadline = Instant::now() + PATIENCE;
+        while !place.path(file).exists() || reloads(file) < n {
+            assert!(Instant::now() < deadline, "{file} has not {n} reloads");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    };
+    wait("elsewhere.jsonl", 1);
+    assert_eq!(reloads("state/audit.jsonl"), 1, "that of the rotation");
+
+    // The node goes on with the log that it has if the new one cannot be opened.
+    fs::create_dir(place.path("folder")).unwrap();
+    let said = reload(&moved.replace("elsewhere.jsonl", "folder"));
+    assert!(said.code == Some(1) && said.stdout.contains("the audit log is as it was: "), "{}", said.stdout);
+    wait("elsewhere.jsonl", 2);
+
+    changed(&format!("{rotation}[audit]\noff = true\n"), &["there is no audit log any more"]);
+    changed(&format!("{rotation}[audit]\noff = true\n"), &["nothing changed"]);
+    changed(rotation, &["the audit log is state/audit.jsonl, at most 9 files of 16777216 bytes"]);
+    wait("state/audit.jsonl", 2);
+    node.end();
+    assert_eq!(reloads("elsewhere.jsonl"), 2, "nothing while it was off");
+}
+
+#[test]
 fn gateway_comes_moves_and_goes_at_a_reload_and_a_taken_port_stops_nothing() {
     let place = Place::new();
     let base = place.read("arm-1.toml");

@@ -322,6 +322,11 @@ impl Share {
         }
     }
 
+    /// Ends the epoch at a time, unless it ends before.
+    pub(crate) fn end_epoch_by(&mut self, at: Instant) {
+        self.rotate_at = self.rotate_at.min(at);
+    }
+
     /// Returns the time at which the new epoch begins, or the next one has to be made.
     pub(crate) fn rotation_deadline(&self) -> Instant {
         self.rotation.as_ref().map_or(self.rotate_at, |r| r.deadline)

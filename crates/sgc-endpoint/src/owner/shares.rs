@@ -81,6 +81,11 @@ impl Shares {
         }
     }
 
+    /// Ends the epochs of all shares at a time, unless they end before.
+    pub(crate) fn end_epochs_by(&mut self, at: Instant) {
+        self.shares.values_mut().for_each(|share| share.end_epoch_by(at));
+    }
+
     /// Returns the time of the next step of a rotation.
     pub(crate) fn rotation_deadline(&self) -> Option<Instant> {
         self.shares.values().map(Share::rotation_deadline).min()

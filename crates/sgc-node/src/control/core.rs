@@ -351,7 +351,10 @@ impl<N: RosNetwork> Core<N> {
                 message_keys,
                 member_names,
                 observers,
+                operators,
                 rights,
+                peer_rate,
+                rotation,
                 reply,
             } => {
                 if let Some(identity) = identity {
@@ -359,6 +362,12 @@ impl<N: RosNetwork> Core<N> {
                 }
                 self.add_message_keys(message_keys);
                 self.set_observers(observers);
+                if let Some(authority) = &mut self.authority {
+                    authority.set_operators(operators);
+                }
+                self.data.rates().set_limit(peer_rate);
+                self.shares.set_epoch_messages_max(rotation.messages);
+                self.endpoint.set_rotate_every(now(), rotation.every);
                 self.rights = rights;
                 self.members.set_names(member_names, self.certificates.identity(), Instant::now());
                 self.reconfigure(shares, uses, anchors);

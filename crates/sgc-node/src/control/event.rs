@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use rand_chacha::ChaCha20Rng;
+use sgc_config::RotationConfig;
 use sgc_ros::{
     DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosClient, RosServer, Routes, ServiceSpec, ShareRule,
     ShownEndpoint, UseRule,
@@ -143,6 +144,12 @@ pub(crate) enum CoreEvent {
         member_names: MemberNames,
         /// The peers that may ask this node how it is doing.
         observers: Grantees,
+        /// The peers that may change the fleet of which this node is the authority.
+        operators: Grantees,
+        /// The rate that each peer may send, bits a second; `None` for no limit.
+        peer_rate: Option<u64>,
+        /// The ends of epochs.
+        rotation: RotationConfig,
         /// The rights that it tells them.
         rights: Arc<ReportRights>,
         /// Notified when the change is under way.

@@ -140,7 +140,7 @@ fn a_proxy_allocates_less_than_once_for_a_sample_that_it_shares() {
         let (data, flow) = (Arc::<DataPlane>::default(), OutFlow::idle());
         forwards(&data, LinkId::LOCAL, vec![(LinkId(1), Out::Link(flow.clone(), Arc::default()))]);
         let (alive, _) = mpsc::channel(1);
-        let share = Arc::new(LocalShare::new(NAME, data, alive, u64::MAX, Arc::default()));
+        let share = Arc::new(LocalShare::new(NAME, data, alive, Arc::new(u64::MAX.into()), Arc::default()));
         let slot = SourceSlot::new(source(suite).0, false, true);
         let own = HashMap::from([(WRITER, slot)]);
         share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });

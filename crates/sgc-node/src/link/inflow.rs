@@ -20,7 +20,7 @@ pub(crate) struct Inflow {
     only: Option<Name>,
     id: LinkId,
     data: Arc<DataPlane>,
-    rate: Option<Arc<PeerRate>>,
+    rate: Arc<PeerRate>,
     activity: Arc<Activity>,
 }
 
@@ -65,7 +65,7 @@ impl Inflow {
     /// like a reliable one.
     async fn admit(&self, packet: &Packet) -> PacketAdmission {
         self.activity.note();
-        let Some(rate) = &self.rate else { return PacketAdmission::Granted };
+        let rate = &self.rate;
         let bytes = packet.encoded_bytes();
         if !packet.header.reliable && packet.header.index == 0 {
             return if rate.take_now(bytes) { PacketAdmission::Granted } else { PacketAdmission::OverRate };
@@ -129,7 +129,7 @@ impl Inflow {
                 ReceivedDatagram::Packet(packet) if !self.belongs(&packet) => {}
                 ReceivedDatagram::Packet(packet) => {
                     self.activity.note();
-                    if self.rate.as_ref().is_none_or(|rate| rate.take_now(packet.encoded_bytes())) {
+                    if self.rate.take_now(packet.encoded_bytes()) {
                         data.forward(id, packet).await;
                     }
                 }

@@ -26,7 +26,6 @@ use crate::control::core::{Core, CoreParts};
 use crate::control::event::{CoreEvent, INBOX_MAX};
 use crate::control::fleet::authority::Authority;
 use crate::control::peers::peer_rate::PeerRates;
-use crate::control::settings::policy::grantees;
 use crate::control::settings::rules::Rules;
 use crate::data::sending::message_keys;
 use crate::data::sinks::SinkRequest;
@@ -40,7 +39,7 @@ use crate::metrics::Metrics;
 use crate::node::error::NodeError;
 use crate::node::local::{OpenNetwork, local_routes, open_again};
 use crate::node::random::system_rng;
-use crate::state::audit::{self, Audit, AuditWriter, PeerNames};
+use crate::state::audit::{self, Audit, AuditPlace, AuditWriter, PeerNames};
 use crate::state::credentials::{StateWriter, with_kept_crls};
 use crate::state::run_lock::RunLock;
 use crate::state::storage::StateStorage;
@@ -69,7 +68,7 @@ pub(super) struct BuiltNode<N: RosNetwork> {
     pub(super) run_lock: RunLock,
     pub(super) audit: Audit,
     pub(super) names: PeerNames,
-    pub(super) audit_writer: Option<AuditWriter>,
+    pub(super) audit_writer: AuditWriter,
     pub(super) sockets: LinkSockets,
     pub(super) network: NetworkSlot<N>,
     pub(super) open: Option<OpenNetwork<N>>,
@@ -140,10 +139,10 @@ pub(super) async fn build<N: RosNetwork>(
         board: board.clone(),
         keep_alive_policy: keep_alive_policy(&config),
         message_keys,
-        authority: config.authority.as_ref().map(|wanted| {
-            let operators = grantees(&wanted.operators, &identity, &rules.partners);
-            Authority::new(wanted.fleet.clone(), operators, identity.node_id())
-        }),
+        authority: config
+            .authority
+            .as_ref()
+            .map(|wanted| Authority::new(wanted.fleet.clone(), rules.operators.clone(), identity.node_id())),
         epoch_messages_max: config.rotation.messages,
         rates: PeerRates::new(config.peer_rate, names.clone()),
         keeper: StateWriter::spawn(state.clone(), config.identity.clone(), run_lock.clone(), alive.clone()),
@@ -352,10 +351,14 @@ fn open_audit(
     config: &Config,
     state: Option<&Path>,
     names: PeerNames,
-) -> Result<(Audit, Option<AuditWriter>), NodeError> {
-    let path = audit::audit_path(config.audit.file.as_deref(), state);
-    let Some(path) = path.filter(|_| !config.audit.off) else { return Ok((Audit::default(), None)) };
-    let (audit, writer) =
-        Audit::open(&path, config.audit.room, names).map_err(|source| NodeError::Audit { path, source })?;
-    Ok((audit, Some(writer)))
+) -> Result<(Audit, AuditWriter), NodeError> {
+    let place = audit_place(config, state);
+    let path = place.as_ref().map(|(path, _)| path.clone()).unwrap_or_default();
+    Audit::start(place, names).map_err(|source| NodeError::Audit { path, source })
+}
+
+/// Returns the place of the audit log; `None` if it is off or there is no state directory.
+pub(crate) fn audit_place(config: &Config, state: Option<&Path>) -> Option<AuditPlace> {
+    let path = audit::audit_path(config.audit.file.as_deref(), state)?;
+    (!config.audit.off).then_some((path, config.audit.room))
 }

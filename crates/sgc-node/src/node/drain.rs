@@ -44,9 +44,8 @@ impl<N: RosNetwork> RunningNode<N> {
             warn!("the local network did not take everything in time");
         }
         self.audit.write(AuditRecord::new(AuditEvent::Stopped));
-        if let Some(writer) = self.audit_writer {
-            let _ = tokio::task::spawn_blocking(move || writer.finish()).await;
-        }
+        let writer = self.audit_writer;
+        let _ = tokio::task::spawn_blocking(move || writer.finish()).await;
         // Closing ends discovery and waits for its threads. The runtime waits for the rest.
         if let Some(network) = self.network.take() {
             let _ = tokio::task::spawn_blocking(move || drop(network)).await;

@@ -50,7 +50,7 @@ pub(super) struct RunningNode<N: RosNetwork> {
     pub(super) gateway: Arc<Gateway>,
     pub(super) network: NetworkSlot<N>,
     pub(super) audit: Audit,
-    pub(super) audit_writer: Option<AuditWriter>,
+    pub(super) audit_writer: AuditWriter,
     /// Ends when every thread and blocking task that uses this runtime has ended.
     pub(super) all_ended: mpsc::Receiver<()>,
     pub(super) run_lock: RunLock,

@@ -15,7 +15,7 @@ mod record;
 
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -54,13 +54,26 @@ pub struct Audit {
     shared: Option<Arc<AuditInner>>,
 }
 
+/// The place of a log: its file, and the room for it.
+pub(crate) type AuditPlace = (PathBuf, AuditRoom);
+
 #[derive(Debug)]
 struct AuditInner {
-    records: SyncSender<Option<AuditRecord>>,
+    entries: SyncSender<Entry>,
+    /// `false` while the log is switched off.
+    is_on: AtomicBool,
     losses: Arc<Losses>,
     names: PeerNames,
     quotas: Arc<Mutex<Quotas>>,
     recent: Mutex<Recent>,
+}
+
+/// Something for the writing thread.
+enum Entry {
+    Record(Box<AuditRecord>),
+    /// Later records go to this file, or nowhere.
+    Move(Option<LateFile>),
+    End,
 }
 
 /// Records that are not in the log.
@@ -99,7 +112,7 @@ impl Losses {
 
 impl AuditInner {
     fn send(&self, record: AuditRecord) {
-        match self.records.try_send(Some(record)) {
+        match self.entries.try_send(Entry::Record(Box::new(record))) {
             Ok(()) => {}
             Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
                 self.losses.add(1);
@@ -119,21 +132,19 @@ impl Audit {
     /// Opens the log at `path` and completes a line that an earlier run left unfinished. If the disk is full or
     /// read-only, the thread opens the log later.
     pub fn open(path: &Path, room: AuditRoom, names: PeerNames) -> io::Result<(Self, AuditWriter)> {
+        Self::start(Some((path.to_owned(), room)), names)
+    }
+
+    /// Does the same as [`Self::open`], or starts with a log that is switched off.
+    pub(crate) fn start(place: Option<AuditPlace>, names: PeerNames) -> io::Result<(Self, AuditWriter)> {
         let losses = Arc::<Losses>::default();
-        let file = match LogFile::open(path, room) {
-            Ok(file) => Some(file),
-            Err(error) if is_storage_fault(&error) => {
-                losses.failed(path, &error);
-                None
-            }
-            Err(error) => return Err(error),
-        };
-        let file = LateFile { path: path.to_owned(), room, file };
-        let (records, waiting) = sync_channel(WAITING_MAX);
+        let file = place.map(|place| LateFile::open(place, &losses)).transpose()?;
+        let (entries, waiting) = sync_channel(WAITING_MAX);
         // The thread holds no sender, so it ends with the last handle.
         let quotas = Arc::<Mutex<Quotas>>::default();
         let shared = Arc::new(AuditInner {
-            records,
+            entries,
+            is_on: AtomicBool::new(file.is_some()),
             losses: losses.clone(),
             names,
             quotas: quotas.clone(),
@@ -146,9 +157,24 @@ impl Audit {
         Ok((audit, AuditWriter { shared, thread }))
     }
 
+    /// Writes later records to another place, or nowhere. After an error nothing has changed. Blocks.
+    pub(crate) fn move_to(&self, place: Option<AuditPlace>) -> io::Result<()> {
+        let Some(shared) = &self.shared else { return Ok(()) };
+        let file = place.map(|place| LateFile::open(place, &shared.losses)).transpose()?;
+        let is_on = file.is_some();
+        shared.entries.send(Entry::Move(file)).map_err(|_| io::Error::other("the node is stopping"))?;
+        shared.is_on.store(is_on, Relaxed);
+        Ok(())
+    }
+
+    /// Returns the shared part of a log that is switched on.
+    fn on(&self) -> Option<&AuditInner> {
+        self.shared.as_deref().filter(|shared| shared.is_on.load(Relaxed))
+    }
+
     /// Queues a record. Never waits.
     pub fn write(&self, mut record: AuditRecord) {
-        let Some(shared) = &self.shared else { return };
+        let Some(shared) = self.on() else { return };
         if let Cause::Peer(peer) = &record.cause {
             record.peer_name = shared.names.get(peer);
         }
@@ -163,12 +189,12 @@ impl Audit {
     /// Returns the last records since the node started, at most [`RECENT_MAX`], oldest first; `None` if the log is
     /// switched off.
     pub fn recent(&self) -> Option<Vec<AuditRecord>> {
-        Some(lock(&self.shared.as_ref()?.recent).all())
+        Some(lock(&self.on()?.recent).all())
     }
 
     /// Returns the last ones about the keeping of the fleet, at most [`RECENT_OF_FLEET_MAX`].
     pub(crate) fn recent_of_fleet(&self) -> Option<Vec<AuditRecord>> {
-        Some(lock(&self.shared.as_ref()?.recent).of_fleet())
+        Some(lock(&self.on()?.recent).of_fleet())
     }
 
     /// Returns the number of records lost since the node started.
@@ -178,7 +204,7 @@ impl Audit {
 
     /// Returns an alert if the last attempt to write the log failed.
     pub(crate) fn alert(&self) -> Option<Alert> {
-        let (path, reason) = lock(&self.shared.as_ref()?.losses.failure).clone()?;
+        let (path, reason) = lock(&self.on()?.losses.failure).clone()?;
         Some(Alert::AuditNotWritten { path: path.display().to_string(), reason })
     }
 
@@ -196,7 +222,7 @@ impl Audit {
 impl AuditWriter {
     /// Waits until all records are on the disk. Later records are lost.
     pub fn finish(self) {
-        let _ = self.shared.records.send(None);
+        let _ = self.shared.entries.send(Entry::End);
         let _ = self.thread.join();
     }
 }
@@ -225,6 +251,19 @@ struct LateFile {
 }
 
 impl LateFile {
+    /// Opens the file, or leaves that for later if the disk is full or read-only.
+    fn open((path, room): AuditPlace, losses: &Losses) -> io::Result<Self> {
+        let file = match LogFile::open(&path, room) {
+            Ok(file) => Some(file),
+            Err(error) if is_storage_fault(&error) => {
+                losses.failed(&path, &error);
+                None
+            }
+            Err(error) => return Err(error),
+        };
+        Ok(Self { path, room, file })
+    }
+
     fn append(&mut self, lines: &str) -> io::Result<()> {
         let file = match self.file.take() {
             Some(file) => file,
@@ -232,54 +271,70 @@ impl LateFile {
         };
         self.file.insert(file).append(lines)
     }
-}
 
-fn write_all(
-    mut file: LateFile,
-    waiting: &Receiver<Option<AuditRecord>>,
-    losses: &Losses,
-    quotas: &Mutex<Quotas>,
-) {
-    let mut ends = false;
-    while !ends {
-        let mut records = Vec::new();
-        let patience = if losses.is_failing() { RETRY_EVERY } else { SUMMARY_DELAY };
-        match waiting.recv_timeout(patience) {
-            Ok(Some(record)) => records.push(record),
-            Err(RecvTimeoutError::Timeout) => lock(quotas).sweep(now().unix.0, &mut records),
-            Ok(None) | Err(RecvTimeoutError::Disconnected) => ends = true,
-        }
-        while !ends && records.len() < BATCH_MAX {
-            match waiting.try_recv() {
-                Ok(Some(record)) => records.push(record),
-                Ok(None) => ends = true,
-                Err(_) => break,
-            }
-        }
-        if ends {
-            lock(quotas).finish(&mut records);
-        }
-        let missing = losses.unreported.swap(0, Relaxed);
-        if records.is_empty() && missing == 0 && !losses.is_failing() {
-            continue;
-        }
-        let mut lines = String::new();
-        records.iter().for_each(|record| push_line(&mut lines, record));
-        if missing > 0 {
-            let record = AuditRecord { lost: Some(missing), ..AuditRecord::new(AuditEvent::Lost) };
-            push_line(&mut lines, &record);
-        }
-        match file.append(&lines) {
-            Ok(()) => losses.written(),
-            Err(error) => {
-                losses.unreported.fetch_add(missing, Relaxed);
-                losses.add(records.len() as u64);
-                losses.failed(&file.path, &error);
-            }
+    /// Syncs the file, after which nothing is written.
+    fn end(self) {
+        if let Some(file) = self.file {
+            let _ = file.sync();
         }
     }
-    if let Some(file) = file.file {
-        let _ = file.sync();
+}
+
+fn write_all(mut file: Option<LateFile>, waiting: &Receiver<Entry>, losses: &Losses, quotas: &Mutex<Quotas>) {
+    loop {
+        let mut records = Vec::new();
+        let patience = if losses.is_failing() { RETRY_EVERY } else { SUMMARY_DELAY };
+        let mut entry = match waiting.recv_timeout(patience) {
+            Ok(entry) => Some(entry),
+            Err(RecvTimeoutError::Timeout) => {
+                lock(quotas).sweep(now().unix.0, &mut records);
+                None
+            }
+            Err(RecvTimeoutError::Disconnected) => Some(Entry::End),
+        };
+        while let Some(Entry::Record(record)) = entry {
+            records.push(*record);
+            entry = if records.len() < BATCH_MAX { waiting.try_recv().ok() } else { None };
+        }
+        if entry.is_some() {
+            lock(quotas).finish(&mut records);
+        }
+        if let Some(file) = &mut file {
+            append_all(file, &records, losses);
+        }
+        match entry {
+            Some(Entry::End) => break,
+            Some(Entry::Move(next)) => {
+                if next.as_ref().is_none_or(|next| next.file.is_some()) {
+                    losses.written();
+                }
+                std::mem::replace(&mut file, next).into_iter().for_each(LateFile::end);
+            }
+            Some(Entry::Record(_)) | None => {}
+        }
+    }
+    file.into_iter().for_each(LateFile::end);
+}
+
+/// Writes records, and the number of those that were lost since the last write.
+fn append_all(file: &mut LateFile, records: &[AuditRecord], losses: &Losses) {
+    let missing = losses.unreported.swap(0, Relaxed);
+    if records.is_empty() && missing == 0 && !losses.is_failing() {
+        return;
+    }
+    let mut lines = String::new();
+    records.iter().for_each(|record| push_line(&mut lines, record));
+    if missing > 0 {
+        let record = AuditRecord { lost: Some(missing), ..AuditRecord::new(AuditEvent::Lost) };
+        push_line(&mut lines, &record);
+    }
+    match file.append(&lines) {
+        Ok(()) => losses.written(),
+        Err(error) => {
+            losses.unreported.fetch_add(missing, Relaxed);
+            losses.add(records.len() as u64);
+            losses.failed(&file.path, &error);
+        }
     }
 }
 

@@ -212,6 +212,11 @@ impl Authority {
         self.queue.push(request)
     }
 
+    /// Sets who may change the fleet. Operations under way go on.
+    pub(crate) fn set_operators(&mut self, permitted: Grantees) {
+        self.operators.set_permitted(permitted);
+    }
+
     /// Judges an operator's request.
     pub(crate) fn ask_operation(
         &mut self,

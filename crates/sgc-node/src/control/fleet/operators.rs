@@ -125,6 +125,11 @@ impl Operators {
         Self { permitted, challenges, executed, attempts: Attempts::default() }
     }
 
+    /// Replaces the operators.
+    pub(crate) fn set_permitted(&mut self, permitted: Grantees) {
+        self.permitted = permitted;
+    }
+
     /// Judges a request.
     pub(crate) fn ask(
         &mut self,

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use sgc_wire::Name;
@@ -21,7 +22,7 @@ pub(crate) struct Shares {
     data: Arc<DataPlane>,
     alive: mpsc::Sender<()>,
     /// Messages of one source under one key.
-    epoch_messages_max: u64,
+    epoch_messages_max: Arc<AtomicU64>,
     /// Notified when a source reaches that number.
     epoch_over: Arc<Notify>,
 }
@@ -31,14 +32,20 @@ impl Shares {
     /// `epoch_messages_max` messages of one source.
     pub(crate) fn new(data: Arc<DataPlane>, alive: mpsc::Sender<()>, epoch_messages_max: u64) -> Self {
         let (shares, epoch_over) = (HashMap::new(), Arc::default());
+        let epoch_messages_max = Arc::new(AtomicU64::new(epoch_messages_max));
         Self { shares, silence_due: None, data, alive, epoch_messages_max, epoch_over }
+    }
+
+    /// Sets the number of messages of one source after which an epoch ends.
+    pub(crate) fn set_epoch_messages_max(&self, messages: u64) {
+        self.epoch_messages_max.store(messages, Relaxed);
     }
 
     /// Adds a share without sources.
     pub(crate) fn add(&mut self, name: Name) -> Arc<LocalShare> {
         let (data, alive) = (self.data.clone(), self.alive.clone());
         let over = self.epoch_over.clone();
-        let share = Arc::new(LocalShare::new(name, data, alive, self.epoch_messages_max, over));
+        let share = Arc::new(LocalShare::new(name, data, alive, self.epoch_messages_max.clone(), over));
         self.shares.insert(name, share.clone());
         share
     }

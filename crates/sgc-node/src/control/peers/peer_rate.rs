@@ -25,7 +25,7 @@ const PEERS_MAX: usize = 4096;
 /// The buckets of all peers.
 #[derive(Debug)]
 pub(crate) struct PeerRates {
-    limit: Option<Limit>,
+    limit: Arc<Limit>,
     names: PeerNames,
     /// Buckets by peer. They are looked up when a link begins and for the status.
     peers: Mutex<BTreeMap<NodeId, Arc<PeerRate>>>,
@@ -33,10 +33,11 @@ pub(crate) struct PeerRates {
     gone: AtomicU64,
 }
 
-#[derive(Clone, Copy, Debug)]
+/// The limit of all peers, which a reload changes.
+#[derive(Debug)]
 struct Limit {
-    bits_per_second: u64,
-    burst_ns: u64,
+    /// Bits a second; 0 if there is no limit.
+    bits_per_second: AtomicU64,
     /// Origin of the nanosecond clock.
     origin: Instant,
 }
@@ -50,22 +51,23 @@ impl Default for PeerRates {
 impl PeerRates {
     /// Creates buckets with the same limit for every peer, in bits a second.
     pub(crate) fn new(limit: Option<u64>, names: PeerNames) -> Self {
-        let limit = limit.map(|bits_per_second| {
-            let mut limit = Limit { bits_per_second, burst_ns: 0, origin: Instant::now() };
-            limit.burst_ns = nanos(BURST).max(limit.cost_ns(BURST_BYTES_MIN));
-            limit
-        });
+        let bits_per_second = AtomicU64::new(limit.unwrap_or(0));
+        let limit = Arc::new(Limit { bits_per_second, origin: Instant::now() });
         Self { limit, names, peers: Mutex::default(), gone: AtomicU64::new(0) }
     }
 
-    /// Returns the bucket of a peer with a link, if there is a limit. It outlives the link until the traffic is paid
-    /// for, so that reconnecting gains nothing.
-    pub(crate) fn for_peer(&self, peer: NodeId) -> Option<Arc<PeerRate>> {
-        self.for_peer_at(self.limit?.now(), peer)
+    /// Sets the limit, in bits a second, for the links that are up, too.
+    pub(crate) fn set_limit(&self, limit: Option<u64>) {
+        self.limit.bits_per_second.store(limit.unwrap_or(0), Relaxed);
     }
 
-    fn for_peer_at(&self, now: u64, peer: NodeId) -> Option<Arc<PeerRate>> {
-        let limit = self.limit?;
+    /// Returns the bucket of a peer with a link. It outlives the link until the traffic is paid for, so that
+    /// reconnecting gains nothing.
+    pub(crate) fn for_peer(&self, peer: NodeId) -> Arc<PeerRate> {
+        self.for_peer_at(self.limit.now(), peer)
+    }
+
+    fn for_peer_at(&self, now: u64, peer: NodeId) -> Arc<PeerRate> {
         let mut peers = lock(&self.peers);
         peers.retain(|id, rate| {
             let stays = *id == peer || Arc::strong_count(rate) > 1 || !rate.is_paid(now);
@@ -79,12 +81,8 @@ impl PeerRates {
         {
             self.gone.fetch_add(rate.over().dropped, Relaxed);
         }
-        Some(
-            peers
-                .entry(peer)
-                .or_insert_with(|| Arc::new(PeerRate::new(peer, self.names.clone(), limit)))
-                .clone(),
-        )
+        let new = || Arc::new(PeerRate::new(peer, self.names.clone(), self.limit.clone()));
+        peers.entry(peer).or_insert_with(new).clone()
     }
 
     /// Returns the counts of delayed and dropped packets of a peer.
@@ -115,10 +113,29 @@ impl Limit {
         nanos(self.origin.elapsed())
     }
 
+    /// Returns the present limit; `None` if there is none.
+    fn rate(&self) -> Option<Rate> {
+        Some(Rate { bits_per_second: self.bits_per_second.load(Relaxed) })
+            .filter(|rate| rate.bits_per_second > 0)
+    }
+}
+
+/// A limit at one moment.
+#[derive(Clone, Copy)]
+struct Rate {
+    bits_per_second: u64,
+}
+
+impl Rate {
     /// Returns the time in which a peer earns this many bytes.
-    fn cost_ns(&self, bytes: u64) -> u64 {
+    fn cost_ns(self, bytes: u64) -> u64 {
         let ns = u128::from(bytes) * 8_000_000_000 / u128::from(self.bits_per_second.max(1));
         ns.try_into().unwrap_or(u64::MAX)
+    }
+
+    /// Returns the time that a peer may have earned in advance.
+    fn burst_ns(self) -> u64 {
+        nanos(BURST).max(self.cost_ns(BURST_BYTES_MIN))
     }
 }
 
@@ -140,7 +157,7 @@ pub(crate) struct Over {
 pub(crate) struct PeerRate {
     peer: NodeId,
     names: PeerNames,
-    limit: Limit,
+    limit: Arc<Limit>,
     /// Time at which all packets are paid for.
     all_ns: AtomicU64,
     /// Time at which the packets that cannot wait are paid for. They precede the others within the same rate.
@@ -151,7 +168,7 @@ pub(crate) struct PeerRate {
 }
 
 impl PeerRate {
-    fn new(peer: NodeId, names: PeerNames, limit: Limit) -> Self {
+    fn new(peer: NodeId, names: PeerNames, limit: Arc<Limit>) -> Self {
         Self {
             peer,
             names,
@@ -166,17 +183,17 @@ impl PeerRate {
 
     /// Takes bytes that cannot wait. Returns `false` if they must be dropped, which is counted.
     pub(crate) fn take_now(&self, bytes: usize) -> bool {
-        self.take_now_at(self.limit.now(), bytes)
+        self.limit.rate().is_none_or(|rate| self.take_now_at(rate, self.limit.now(), bytes))
     }
 
     /// Takes bytes that can wait. Returns the delay.
     pub(crate) fn take_later(&self, bytes: usize) -> Duration {
-        self.take_later_at(self.limit.now(), bytes)
+        self.limit.rate().map_or(Duration::ZERO, |rate| self.take_later_at(rate, self.limit.now(), bytes))
     }
 
-    fn take_now_at(&self, now: u64, bytes: usize) -> bool {
-        let cost = self.limit.cost_ns(bytes as u64);
-        let most = now.saturating_add(self.limit.burst_ns);
+    fn take_now_at(&self, rate: Rate, now: u64, bytes: usize) -> bool {
+        let cost = rate.cost_ns(bytes as u64);
+        let most = now.saturating_add(rate.burst_ns());
         let after = |paid: u64| Some(paid.max(now).saturating_add(cost)).filter(|after| *after <= most);
         if self.hasty_ns.fetch_update(Relaxed, Relaxed, after).is_err() {
             self.dropped.fetch_add(1, Relaxed);
@@ -187,9 +204,9 @@ impl PeerRate {
         true
     }
 
-    fn take_later_at(&self, now: u64, bytes: usize) -> Duration {
-        let paid = self.charge(now, self.limit.cost_ns(bytes as u64));
-        let wait = Duration::from_nanos(paid.saturating_sub(now.saturating_add(self.limit.burst_ns)));
+    fn take_later_at(&self, rate: Rate, now: u64, bytes: usize) -> Duration {
+        let paid = self.charge(now, rate.cost_ns(bytes as u64));
+        let wait = Duration::from_nanos(paid.saturating_sub(now.saturating_add(rate.burst_ns())));
         if !wait.is_zero() {
             self.slowed.fetch_add(1, Relaxed);
             self.name_it("what can wait is slowed");
@@ -231,14 +248,16 @@ mod tests {
     const SECOND: u64 = 1_000_000_000;
 
     /// 8 Mbit/s: one packet a millisecond, and 262 144 bytes at once.
+    const RATE: Rate = Rate { bits_per_second: 8_000_000 };
+
     fn rate() -> Arc<PeerRate> {
-        PeerRates::new(Some(8_000_000), PeerNames::default()).for_peer(NodeId([1; 32])).unwrap()
+        PeerRates::default().for_peer(NodeId([1; 32]))
     }
 
     #[test]
     fn packets_that_cannot_wait_pass_at_most_at_the_peer_rate() {
         let rate = rate();
-        let passed = |now| (0..2000).filter(|_| rate.take_now_at(now, PACKET)).count();
+        let passed = |now| (0..2000).filter(|_| rate.take_now_at(RATE, now, PACKET)).count();
         assert_eq!(passed(0), 262);
         assert_eq!(passed(SECOND / 10), 100);
         // Savings are bounded.
@@ -252,10 +271,10 @@ mod tests {
         let mut now = 0;
         let mut hasty = 0;
         for _ in 0..4000 {
-            now += nanos(rate.take_later_at(now, PACKET));
+            now += nanos(rate.take_later_at(RATE, now, PACKET));
             // These use half of the rate.
             while hasty < now / 2_000_000 {
-                assert!(rate.take_now_at(now, PACKET));
+                assert!(rate.take_now_at(RATE, now, PACKET));
                 hasty += 1;
             }
         }
@@ -265,31 +284,45 @@ mod tests {
         assert!(rate.over().slowed > 3000 && rate.over().dropped == 0);
         // The delayed packets do not keep the others from passing.
         for _ in 0..10_000 {
-            rate.take_later_at(now, PACKET);
+            rate.take_later_at(RATE, now, PACKET);
         }
-        assert!(rate.take_later_at(now, PACKET) > Duration::from_secs(9));
-        assert!(rate.take_now_at(now, PACKET));
+        assert!(rate.take_later_at(RATE, now, PACKET) > Duration::from_secs(9));
+        assert!(rate.take_now_at(RATE, now, PACKET));
     }
 
     #[test]
     fn linking_again_gains_nothing() {
-        let rates = PeerRates::new(Some(8_000_000), PeerNames::default());
-        let of = |now, id| rates.for_peer_at(now, NodeId([id; 32])).unwrap();
+        let rates = PeerRates::default();
+        let of = |now, id| rates.for_peer_at(now, NodeId([id; 32]));
         let first = of(0, 1);
         assert!(Arc::ptr_eq(&first, &of(0, 1)));
-        while first.take_now_at(0, PACKET) {}
+        while first.take_now_at(RATE, 0, PACKET) {}
         drop(first);
-        assert!(of(SECOND / 10, 2).take_now_at(SECOND / 10, 200 * PACKET));
-        assert!(!of(SECOND / 10, 1).take_now_at(SECOND / 10, 200 * PACKET));
+        assert!(of(SECOND / 10, 2).take_now_at(RATE, SECOND / 10, 200 * PACKET));
+        assert!(!of(SECOND / 10, 1).take_now_at(RATE, SECOND / 10, 200 * PACKET));
         assert_eq!((rates.drops()["over_rate"], rates.over(&NodeId([1; 32])).dropped), (2, 2));
         // A peer that has paid is forgotten.
-        assert!(of(SECOND, 3).take_now_at(SECOND, PACKET));
+        assert!(of(SECOND, 3).take_now_at(RATE, SECOND, PACKET));
         assert_eq!(
             rates.drops(),
             BTreeMap::from([("over_rate".to_owned(), 2)]),
             "and its drops are in the total"
         );
-        let one = NodeId([1; 32]);
-        assert!(PeerRates::default().for_peer(one).is_none());
+    }
+
+    #[test]
+    fn another_limit_holds_for_links_that_are_up() {
+        let rates = PeerRates::new(None, PeerNames::default());
+        let rate = rates.for_peer(NodeId([1; 32]));
+        let passed = || (0..2000).filter(|_| rate.take_now(PACKET)).count();
+        assert_eq!(passed(), 2000);
+        assert!((0..2000).all(|_| rate.take_later(PACKET).is_zero()));
+        // A day a packet, after the first 262 144 bytes.
+        rates.set_limit(Some(1));
+        assert_eq!(passed(), 262);
+        assert!(rate.take_later(PACKET) > Duration::from_secs(1000));
+        rates.set_limit(None);
+        assert_eq!(passed(), 2000);
+        assert_eq!(rate.over(), Over { slowed: 1, dropped: 2000 - 262 });
     }
 }

@@ -4,14 +4,15 @@
 //! This module computes the differences; the route machine carries them out.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::io;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
-use sgc_config::{Config, ConfigErrors, GatewayConfig, MetricsConfig, RosConfig};
+use sgc_config::{Config, ConfigErrors, GatewayConfig, MetricsConfig, RosConfig, RotationConfig};
 use sgc_gateway::Access;
 use sgc_ros::{Direction, ShareRule, UseRule};
 use sgc_transport::CredentialStore;
@@ -31,7 +32,7 @@ use crate::gateway::{Gateway, GatewayStartError, listen_at};
 use crate::link::roaming::Network;
 use crate::local::network_slot::JoinNetwork;
 use crate::metrics::Metrics;
-use crate::node::build::listen_for_clients;
+use crate::node::build::{audit_place, listen_for_clients};
 use crate::node::error::NodeError;
 use crate::node::identity::{FileIdentity, wanted_nearby};
 use crate::state::audit::{Audit, AuditEvent, AuditRecord, PeerNames};
@@ -182,7 +183,11 @@ impl Reloader {
         reads: ReadIdentity,
     ) -> Result<ReloadReport, String> {
         let prepared = self.prepare(running, &config, reads).await?;
-        let PreparedReload { rules, identity, anchors, message_keys, gateway } = prepared;
+        let PreparedReload { mut rules, identity, anchors, message_keys, gateway } = prepared;
+        if fleet_of(&running.config) != fleet_of(&config) {
+            // They are for the fleet that this node keeps after a restart.
+            rules.operators.clone_from(&running.rules.operators);
+        }
         let nearby = wanted_nearby(&config.routers, &self.identity).map_err(|error| error.to_string())?;
         self.join(running, config.ros.as_ref()).await?;
         running.suites.extend(message_keys.keys().copied());
@@ -219,7 +224,8 @@ impl Reloader {
         }
         // This precedes the control task's check of existing links.
         self.credentials.set_admitted(rules.partners.admitted.clone());
-        self.reconfigure(&rules, identity, anchors, message_keys).await?;
+        self.reconfigure(&rules, identity, anchors, message_keys, (config.peer_rate, config.rotation))
+            .await?;
         // The control task has the newest revocation lists.
         if let Some((access, key)) = gateway.filter(|_| running.config.gateway.is_some()) {
             match self.reconfigure_gateway(running, &config, access, key.as_ref()) {
@@ -257,6 +263,26 @@ impl Reloader {
             self.metrics.set(config.metrics.as_ref());
             report.warnings.extend(config.metrics.iter().flat_map(MetricsConfig::warnings));
             report.changed.extend(metrics_changes(running.config.metrics.as_ref(), config.metrics.as_ref()));
+        }
+        match self.move_audit(running, &config).await {
+            Ok(changed) => report.changed.extend(changed),
+            Err(error) => {
+                report.needs_restart.push(format!("the audit log is as it was: {error}"));
+                // The next reload tries again.
+                config.audit.clone_from(&running.config.audit);
+            }
+        }
+        if running.config.peer_rate != config.peer_rate {
+            report.changed.push(match config.peer_rate {
+                Some(rate) => format!("each peer may send {} Mbit/s", rate as f64 / 1e6),
+                None => "peers may send as much as they like".to_owned(),
+            });
+        }
+        if running.config.rotation != config.rotation {
+            let RotationConfig { every, messages } = config.rotation;
+            report
+                .changed
+                .push(format!("topics get a new key after {} s or {messages} messages", every.as_secs()));
         }
         self.names.set(rules.names.clone());
         running.config = merged(running.config.clone(), config);
@@ -330,11 +356,13 @@ impl Reloader {
         identity: Option<Arc<Identity>>,
         anchors: Option<TrustAnchors>,
         message_keys: MessageKeys,
+        (peer_rate, rotation): (Option<u64>, RotationConfig),
     ) -> Result<(), String> {
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let member_names = rules.members.clone();
-        let (observers, rights) = (rules.observers.clone(), rules.rights.clone());
+        let (observers, operators) = (rules.observers.clone(), rules.operators.clone());
+        let rights = rules.rights.clone();
         let event = CoreEvent::Reload {
             identity,
             shares,
@@ -343,7 +371,10 @@ impl Reloader {
             message_keys,
             member_names,
             observers,
+            operators,
             rights,
+            peer_rate,
+            rotation,
             reply,
         };
         let stopping = || "the node is stopping".to_owned();
@@ -379,6 +410,26 @@ impl Reloader {
             }
             (Some(_), Some(_)) | (None, None) => Ok(Vec::new()),
         }
+    }
+
+    /// Moves the audit log, or switches it on or off. Returns the changes.
+    async fn move_audit(&self, running: &Running, config: &Config) -> io::Result<Vec<String>> {
+        if running.config.audit == config.audit {
+            return Ok(Vec::new());
+        }
+        let place = audit_place(config, self.state.as_deref());
+        let changed = match &place {
+            Some((path, room)) => format!(
+                "the audit log is {}, at most {} files of {} bytes",
+                path.display(),
+                room.files + 1,
+                room.max_bytes
+            ),
+            None => "there is no audit log any more".to_owned(),
+        };
+        let audit = self.audit.clone();
+        tokio::task::spawn_blocking(move || audit.move_to(place)).await.map_err(io::Error::other)??;
+        Ok(vec![changed])
     }
 
     /// Applies new access rules and another certificate to the gateway. Returns the changes.
@@ -477,14 +528,47 @@ impl Reloader {
 /// Returns the configuration that runs after a reload. Restart-only settings keep their running values, so that the
 /// next reload reports them again.
 fn merged(before: Config, read: Config) -> Config {
+    let authority = match fleet_of(&before) == fleet_of(&read) {
+        true => read.authority.clone(),
+        false => before.authority.clone(),
+    };
     let Config {
-        routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, observers, ..
+        routers,
+        shares,
+        uses,
+        tokens,
+        partners,
+        trust,
+        accept,
+        gateway,
+        metrics,
+        observers,
+        peer_rate,
+        audit,
+        rotation,
+        ..
     } = read;
     let gateway = match (&before.gateway, gateway) {
         (Some(before), Some(after)) => Some(with_buffers_of(before, &after)),
         (_, after) => after,
     };
-    Config { routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, observers, ..before }
+    Config {
+        routers,
+        shares,
+        uses,
+        tokens,
+        partners,
+        trust,
+        accept,
+        gateway,
+        metrics,
+        observers,
+        peer_rate,
+        audit,
+        rotation,
+        authority,
+        ..before
+    }
 }
 
 /// Returns the part of a gateway's configuration that decides who may connect.
@@ -580,6 +664,9 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     if old.observers != new.observers {
         lines.push("who may ask this node how it is doing changed".to_owned());
     }
+    if old.operators != new.operators {
+        lines.push("who may change the fleet here changed".to_owned());
+    }
     lines
 }
 
@@ -619,6 +706,11 @@ fn share_change(topic: &str, known: &ShareRule, rule: &ShareRule) -> String {
     format!("{topic}: {} changed{end}", what.join(", "))
 }
 
+/// Returns the fleet file of which the node is the authority.
+fn fleet_of(config: &Config) -> Option<&Path> {
+    config.authority.as_ref().map(|authority| &*authority.fleet)
+}
+
 fn needs_restart(running: &Running, config: &Config) -> Vec<String> {
     let now = &running.config;
     [
@@ -627,7 +719,6 @@ fn needs_restart(running: &Running, config: &Config) -> Vec<String> {
         (now.resolver != config.resolver, "`resolver`"),
         (now.keep_alive != config.keep_alive, "`keep_alive`"),
         (now.listen != config.listen, "`listen` in [router]"),
-        (now.peer_rate != config.peer_rate, "`peer_rate` in [router]"),
         (now.mapping != config.mapping, "`mapping` in [router]"),
         (now.announce != config.announce, "`announce` in [router]"),
         // Shares and uses join the default network if the file has no `[ros]`.
@@ -638,9 +729,7 @@ fn needs_restart(running: &Running, config: &Config) -> Vec<String> {
         ),
         (now.state != config.state, "`state`"),
         (now.watch != config.watch, "`watch`"),
-        (now.authority != config.authority, "[authority]"),
-        (now.rotation != config.rotation, "[rotation]"),
-        (now.audit != config.audit, "[audit]"),
+        (fleet_of(now) != fleet_of(config), "`fleet` in [authority]"),
         (now.transport != config.transport, "[transport]"),
         (now.admin_socket != config.admin_socket, "`socket` in [admin]"),
     ]

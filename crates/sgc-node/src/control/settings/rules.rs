@@ -34,6 +34,8 @@ pub(crate) struct Rules {
     pub(crate) members: MemberNames,
     /// The peers that may ask this node how it is doing.
     pub(crate) observers: Grantees,
+    /// Who may change the fleet, if this node is its authority.
+    pub(crate) operators: Grantees,
     /// The rights in the words of the configuration, for observers.
     pub(crate) rights: Arc<ReportRights>,
     /// Faults that prevent nothing.
@@ -69,6 +71,9 @@ impl Rules {
         rules.members = MemberNames::from_config(config, identity);
         rules.rights = Arc::new(policy::written_rights(config, &rules.partners));
         rules.observers = policy::grantees(&config.observers(), identity, &rules.partners);
+        let operators =
+            config.authority.as_ref().map(|authority| &authority.operators[..]).unwrap_or_default();
+        rules.operators = policy::grantees(operators, identity, &rules.partners);
         let is_unknown = |one: &Recipient| match one {
             Recipient::Node(node) => identity.node_id_of(node.as_str()).is_none(),
             Recipient::Group(group) => identity.group_tag(group.as_str()).is_none(),

@@ -77,7 +77,7 @@ pub(crate) fn map_of(slot: SourceSlot) -> SourceMap {
 pub(crate) fn share() -> (Arc<DataPlane>, Arc<LocalShare>, SourceSlot) {
     let (alive, _) = mpsc::channel(1);
     let data = Arc::<DataPlane>::default();
-    let share = Arc::new(LocalShare::new(NAME, data.clone(), alive, 2, Arc::default()));
+    let share = Arc::new(LocalShare::new(NAME, data.clone(), alive, Arc::new(2.into()), Arc::default()));
     let slot = slot_with_id(1);
     share.set_map(map_of(slot.clone()));
     (data, share, slot)

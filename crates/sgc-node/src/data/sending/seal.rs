@@ -21,7 +21,7 @@ use crate::data::stats::{DataDrop, Dropped};
 /// Seals the messages of one share.
 pub(crate) struct SealStage {
     /// Messages of one source under one key before a new epoch begins.
-    epoch_messages_max: u64,
+    epoch_messages_max: Arc<AtomicU64>,
     /// Whether the message limit of the epoch is reached and the next epoch has not begun.
     is_rotating: AtomicBool,
     /// Whether the control task has yet to see that the epoch is over.
@@ -45,7 +45,7 @@ pub(crate) enum Destination {
 
 impl SealStage {
     /// Creates the stage of a share. `control` is notified when an epoch or a silence ends.
-    pub(crate) fn new(epoch_messages_max: u64, control: Arc<Notify>) -> Self {
+    pub(crate) fn new(epoch_messages_max: Arc<AtomicU64>, control: Arc<Notify>) -> Self {
         Self {
             epoch_messages_max,
             is_rotating: AtomicBool::new(false),
@@ -90,7 +90,7 @@ impl SealStage {
         if self.silence.end(&slot.progress) {
             self.control.notify_one();
         }
-        if slot.progress.published_in_epoch() >= self.epoch_messages_max
+        if slot.progress.published_in_epoch() >= self.epoch_messages_max.load(Relaxed)
             && !self.is_rotating.swap(true, Relaxed)
         {
             self.is_over.store(true, SeqCst);
@@ -160,7 +160,8 @@ mod tests {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let data = Arc::<DataPlane>::default();
         let (flow, emit) = (add_link(&data), EmitStage::new(NAME, data, runtime.handle().clone()));
-        let (stage, slot) = (SealStage::new(u64::MAX, Arc::default()), slot_with_id(1));
+        let (stage, slot) =
+            (SealStage::new(Arc::new(AtomicU64::new(u64::MAX)), Arc::default()), slot_with_id(1));
         let left = || queued(&flow).map(|packet| (packet.header.seq, packet.header.to));
         assert_eq!(seal(&stage, &slot, Destination::Everyone { more: false }, &emit), Ok(()));
         assert_eq!([left(), left()], [Some((1, None)), None]);
@@ -184,7 +185,7 @@ mod tests {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let emit = EmitStage::new(NAME, Arc::default(), runtime.handle().clone());
         let (control, slot) = (Arc::<Notify>::default(), slot_with_id(1));
-        let stage = SealStage::new(2, control.clone());
+        let stage = SealStage::new(Arc::new(AtomicU64::new(2)), control.clone());
         let publish = || seal(&stage, &slot, Destination::History, &emit).unwrap();
         publish();
         assert!(is_notified(&control), "the silence is over");

@@ -5,7 +5,7 @@
 //! share a signature; none waits for a later one.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed, Ordering::SeqCst};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed, Ordering::SeqCst};
 use std::sync::{Arc, MutexGuard, Weak};
 use std::time::{Duration, Instant};
 
@@ -71,7 +71,7 @@ impl LocalShare {
         name: Name,
         data: Arc<DataPlane>,
         alive: mpsc::Sender<()>,
-        epoch_messages_max: u64,
+        epoch_messages_max: Arc<AtomicU64>,
         over: Arc<Notify>,
     ) -> Self {
         let runtime = Handle::current();
