@@ -4,6 +4,7 @@
 # the Debian and for ROS 2.
 # With `new-user`, plays somebody who follows the guides from the package to the first topic, and prints commands and times.
 #   SGC_DIST_SUITE    the release of Debian (that of this machine)
+#   SGC_OLD           the earlier program that is upgraded (this one)
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
@@ -34,12 +35,20 @@ cp -a "$base" "$machine"
 
 mkdir "$machine/test"
 cp "tests/dist/$plays.sh" tests/dist/chatter.py "$machine/test"
-cp "$package" "$machine/test/first.deb"
-# The same program under a later version, for the upgrade.
-dpkg-deb -R "$package" "$place/later"
-sed -i 's/^Version: .*/&+later/' "$place/later/DEBIAN/control"
-dpkg-deb --root-owner-group -b "$place/later" "$machine/test/later.deb" >/dev/null
-rm -rf "$place/later"
+# Makes a package of the same files: NAME, what follows its version, and another program if there is one.
+repack() {
+    local parts=$place/$1
+    rm -rf "$parts"
+    dpkg-deb -R "$package" "$parts"
+    sed -i "s/^Version: .*/&$2/" "$parts/DEBIAN/control"
+    if [ -n "${3:-}" ]; then install -m 755 "$3" "$parts/usr/bin/sgc"; fi
+    # The checksums are those of the other program.
+    rm -f "$parts/DEBIAN/md5sums"
+    dpkg-deb --root-owner-group -b "$parts" "$machine/test/$1.deb" >/dev/null
+    rm -rf "$parts"
+}
+repack first '' "${SGC_OLD:-}"
+repack later +later
 cat >"$machine/etc/systemd/system/sgc-test.service" <<'UNIT'
 [Unit]
 After=multi-user.target

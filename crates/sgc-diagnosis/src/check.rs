@@ -6,7 +6,6 @@
 use std::path::Path;
 
 use sgc_gateway::Anonymous;
-use sgc_node::UnknownMember;
 use sgc_node::alerts::{Alert, clock_alert};
 use sgc_node::config::{
     Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig, TokenSource,
@@ -14,7 +13,7 @@ use sgc_node::config::{
 use sgc_node::discovery_server;
 use sgc_process::files;
 use sgc_process::unix_now;
-use sgc_trust::Identity;
+use sgc_trust::{Fleet, Identity};
 use sgc_types::Definitions;
 use sgc_wire::PayloadForm;
 
@@ -27,11 +26,13 @@ pub const FLEET_EXTENSION: &str = "fleet";
 /// The heading of a warning.
 pub const WARNING: &str = "warning";
 
-/// Returns rows that describe the node, and warnings. `file` is the configuration.
+/// Returns rows that describe the node, and warnings. `file` is the configuration. Without `fleet`, the fleet file is
+/// looked for.
 pub fn summary(
     config: &Config,
     identity: &Identity,
     file: &Path,
+    fleet: Option<&Path>,
     environment: &dyn Fn(&str) -> Option<String>,
 ) -> Result<Vec<Vec<String>>, DiagnosisError> {
     let mut rows = Vec::new();
@@ -169,7 +170,11 @@ pub fn summary(
             rows.push(vec![WARNING.to_owned(), format!("{alert}: {}", alert.fix())]);
         }
     }
-    for unknown in unknown_members(config, identity, file) {
+    let fleet = match fleet {
+        Some(path) => Some(fleet_of(identity, path)?),
+        None => find_fleet(config, identity, file),
+    };
+    for unknown in fleet.iter().flat_map(|fleet| sgc_node::unknown_members(config, fleet)) {
         rows.push(vec![WARNING.to_owned(), unknown.to_string()]);
     }
     let state = sgc_node::state_dir(config, identity.node_name().as_str());
@@ -182,17 +187,24 @@ pub fn summary(
     Ok(rows)
 }
 
-/// Returns the members that rules name and the fleet file lacks, if that file is at hand: the authority's, or one in
-/// this directory, beside the configuration or beside the identity.
-fn unknown_members(config: &Config, identity: &Identity, file: &Path) -> Vec<UnknownMember> {
-    let own = identity.as_peer().ca;
+/// Reads the fleet file that a user named.
+fn fleet_of(identity: &Identity, path: &Path) -> Result<Fleet, DiagnosisError> {
+    let fleet = sgc_node::read_fleet(path)?;
+    if fleet.anchors().fingerprints().any(|ca| ca == identity.as_peer().ca) {
+        return Ok(fleet);
+    }
+    let (path, node) = (path.to_owned(), identity.node_name().to_string());
+    Err(DiagnosisError::OtherFleet { path, node })
+}
+
+/// Reads the fleet file if it is at hand: the authority's, or one in this directory, beside the configuration or beside
+/// the identity.
+fn find_fleet(config: &Config, identity: &Identity, file: &Path) -> Option<Fleet> {
     let dirs = [Some(Path::new("")), file.parent(), config.identity.parent()].into_iter().flatten();
     let dirs = dirs.map(|dir| if dir == Path::new("") { Path::new(".") } else { dir });
     let found = dirs.flat_map(|dir| files::with_extension(dir, FLEET_EXTENSION).unwrap_or_default());
     let authority = config.authority.as_ref().map(|authority| authority.fleet.clone());
-    let fleets = authority.into_iter().chain(found).filter_map(|path| sgc_node::read_fleet(&path).ok());
-    let fleet = fleets.into_iter().find(|fleet| fleet.anchors().fingerprints().any(|ca| ca == own));
-    fleet.map_or_else(Vec::new, |fleet| sgc_node::unknown_members(config, &fleet))
+    authority.into_iter().chain(found).find_map(|path| fleet_of(identity, &path).ok())
 }
 
 /// Returns the rows about the gateway: addresses, permitted clients, and notes for the operator.

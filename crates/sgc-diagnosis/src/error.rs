@@ -37,4 +37,15 @@ pub enum DiagnosisError {
         /// The identity file.
         path: PathBuf,
     },
+    /// A fleet file cannot be read.
+    #[error(transparent)]
+    Fleet(#[from] sgc_node::FleetFileError),
+    /// A fleet file whose CA did not certify the node.
+    #[error("{} is the file of another fleet than that of {node}", path.display())]
+    OtherFleet {
+        /// The fleet file.
+        path: PathBuf,
+        /// The node.
+        node: String,
+    },
 }

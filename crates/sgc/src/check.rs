@@ -24,6 +24,10 @@ pub(crate) struct CheckArgs {
     /// Configuration file; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Fleet file that names the fleet's nodes and groups; without it, the one of the fleet that is in this directory,
+    /// or beside the configuration or the identity
+    #[arg(long, value_name = "FILE")]
+    fleet: Option<PathBuf>,
     /// Print the description as JSON: a list of texts for each heading
     #[arg(long)]
     json: bool,
@@ -37,7 +41,7 @@ pub(crate) fn check(args: &CheckArgs) -> Result<(), CliError> {
         .map_err(|errors| CliError::Config { what: what.clone(), errors })?;
     let identity = sgc_node::check_identity(&config)
         .map_err(|source| CliError::CheckIdentity { what: what.clone(), source })?;
-    let summary = summary(&config, &identity, &path, &environment)?;
+    let summary = summary(&config, &identity, &path, args.fleet.as_deref(), &environment)?;
     if args.json {
         return output::line(json(&summary)?);
     }

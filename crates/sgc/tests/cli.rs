@@ -298,8 +298,16 @@ fn a_good_configuration_is_summed_up() {
         assert!(said.contains(&warning), "{said}");
     }
     assert_eq!(said.matches("warning").count(), 2, "{said}");
-    fs::remove_file(place.path().join("lab.fleet")).unwrap();
+    // The fleet file may be elsewhere, as on the laptop of the fleet's keeper.
+    fs::create_dir(place.path().join("safe")).unwrap();
+    fs::rename(place.path().join("lab.fleet"), place.path().join("safe/lab.fleet")).unwrap();
     assert!(!place.good(&["check", "-c", "node.toml"]).contains("warning"), "nobody can say");
+    let there = place.good(&["check", "-c", "node.toml", "--fleet", "safe/lab.fleet"]);
+    assert_eq!(there, said);
+    assert!(place.bad(1, &["check", "-c", "node.toml", "--fleet", "lab.fleet"]).contains("lab.fleet"));
+    place.good(&["fleet", "create", "acme"]);
+    let other = place.bad(1, &["check", "-c", "node.toml", "--fleet", "acme.fleet"]);
+    assert!(other.contains("acme.fleet is the file of another fleet than that of arm-1"), "{other}");
 }
 
 #[test]
