@@ -378,4 +378,10 @@ fn node_takes_all_the_open_files_that_it_may_have() {
     let open_files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
     let [soft, hard] = [3, 4].map(|column| open_files.split_whitespace().nth(column));
     assert!(soft == hard && soft != Some("64"), "{open_files}");
+    drop(desk);
+
+    // A gateway leaves files for everything else.
+    let _desk = place.start_desk_on("ulimit -n 64", "state = \"desk.state\"");
+    let said = "the gateway takes 32 clients at once instead of 512: this process may open 64 files";
+    eventually("it says how many clients it takes", || place.log().contains(said));
 }

@@ -6,6 +6,7 @@
 
 pub(crate) mod access;
 pub(crate) mod certificate;
+mod files;
 mod network;
 
 use std::path::Path;
@@ -28,6 +29,7 @@ use tokio::sync::OnceCell;
 use tracing::{info, warn};
 
 use self::certificate::{GatewayCertificateError, ShownKey};
+use self::files::clients_within_files;
 use self::network::{GatewayNetwork, HubNetwork};
 use crate::control::faults::alerts::Alert;
 use crate::state::is_storage_fault;
@@ -176,6 +178,7 @@ impl Gateway {
         let limits =
             SessionLimits { waiting_bytes_max: sockets.client_bytes_max, ..SessionLimits::default() };
         let Sockets { listen, access, key, identity, clients_max, .. } = sockets;
+        let clients_max = clients_within_files(clients_max);
         let name = format!("sgc {}", self.name);
         let keys = key.map(|key| tls_keys(&key, &identity));
         let options = ServerOptions { name, listen, access, keys, clients_max, limits };
@@ -285,11 +288,13 @@ impl Gateway {
         Ok(())
     }
 
-    /// Changes the number of clients that may be connected at once.
-    pub(crate) fn set_clients_max(&self, clients_max: usize) {
+    /// Changes the number of clients that may be connected at once. Returns the number, which open files bound.
+    pub(crate) fn set_clients_max(&self, clients_max: usize) -> usize {
+        let clients_max = clients_within_files(clients_max);
         if let Some(server) = self.server() {
             server.set_clients_max(clients_max);
         }
+        clients_max
     }
 
     /// Shows the node's renewed certificate to members of its fleet that connect from now on.

@@ -449,8 +449,8 @@ impl Reloader {
         if let Some((before, after)) = running.config.gateway.as_ref().zip(config.gateway.as_ref())
             && before.clients_max != after.clients_max
         {
-            self.gateway.set_clients_max(after.clients_max);
-            changed.push(format!("the gateway takes {} clients at once", after.clients_max));
+            let clients = self.gateway.set_clients_max(after.clients_max);
+            changed.push(format!("the gateway takes {clients} clients at once"));
         }
         if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
             changed.push("who may connect to the gateway changed".to_owned());
