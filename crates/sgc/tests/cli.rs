@@ -3,11 +3,14 @@
 #![allow(clippy::unwrap_used)]
 
 use std::fs;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::UnixListener;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
+use sgc_node::admin::TapHead;
 use sgc_trust::{EnrollRequest, Fleet, Identity, derive_name};
 use sgc_wire::{Metadata, UnixMillis};
 use tempfile::TempDir;
@@ -642,6 +645,81 @@ fn name_ca_and_access_token_are_printed_as_json() {
     assert!(json["token"].as_str().is_some_and(|token| !token.is_empty()));
 }
 
+/// Serves the taps of one `sgc topic` command at this socket: a topic with three messages, which then falls silent.
+fn serve_taps(socket: &Path, taps: usize) -> std::thread::JoinHandle<()> {
+    let listener = UnixListener::bind(socket).unwrap();
+    std::thread::spawn(move || {
+        for _ in 0..taps {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut request = String::new();
+            BufReader::new(&stream).read_line(&mut request).unwrap();
+            assert!(request.contains("tap any ") && request.ends_with(" /t\n"), "{request}");
+            stream.write_all(b"{\"ok\":{\"type\":\"geometry_msgs/msg/PointStamped\"}}\n").unwrap();
+            for n in 0..3 {
+                let head = TapHead {
+                    kind: 0,
+                    source_timestamp_ns: 0,
+                    seen_unix_ns: 5_250_000_000,
+                    seen_ns: n * 125_000_000,
+                    dropped: 0,
+                    bytes: 1000,
+                    carried: 12,
+                };
+                // Little endian, stamped 5 s after the epoch.
+                let payload = [0, 1, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0];
+                // A command that wants only the type ends the connection at once.
+                if stream.write_all(&[&head.to_bytes()[..], &payload].concat()).is_err() {
+                    break;
+                }
+            }
+            let _ = stream.read_to_end(&mut Vec::new());
+        }
+    })
+}
+
+#[test]
+fn rate_bandwidth_and_delay_are_printed_as_a_line_of_json_per_report() {
+    let place = Place::new();
+    for (command, taps, figures, silent) in [
+        (
+            "hz",
+            1,
+            serde_json::json!({
+                "messages": 3, "rate_hz": 8.0, "period_min_s": 0.125, "period_max_s": 0.125, "period_std_dev_s": 0.0,
+            }),
+            "rate_hz",
+        ),
+        (
+            "bw",
+            1,
+            serde_json::json!({
+                "messages": 3, "bytes_per_s": 8000.0, "message_mean_bytes": 1000.0, "message_min_bytes": 1000.0,
+                "message_max_bytes": 1000.0,
+            }),
+            "bytes_per_s",
+        ),
+        (
+            "delay",
+            2,
+            serde_json::json!({
+                "messages": 3, "delay_s": 0.25, "delay_min_s": 0.25, "delay_max_s": 0.25, "delay_std_dev_s": 0.0,
+            }),
+            "delay_s",
+        ),
+    ] {
+        let socket = place.path().join(command);
+        let node = serve_taps(&socket, taps);
+        let said = place.good(&["topic", command, "/t", "--json", "-n", "2", "--socket", command]);
+        let reports: Vec<Value> = said.lines().map(|line| serde_json::from_str(line).expect(line)).collect();
+        assert_eq!(reports.len(), 2, "{said}");
+        assert_eq!(reports[0], figures);
+        // The second report has no new messages.
+        assert_eq!((&reports[1]["messages"], &reports[1][silent]), (&0.into(), &Value::Null));
+        assert_eq!(reports[1].as_object().unwrap().len(), figures.as_object().unwrap().len());
+        node.join().unwrap();
+    }
+}
+
 #[test]
 fn validity_in_days_is_refused_with_its_span() {
     let place = Place::with_fleet();
@@ -769,7 +847,7 @@ fn status_of_no_node_says_so() {
     );
     place.says(1, &["status", "--socket", "x.sock"], "no node runs at x.sock: there is no such socket");
     place.write("node.toml", "[node]\nname = 'arm-1'\nrouters = ['quic://a']\n[admin]\nsocket = 'a.sock'\n");
-    drop(std::os::unix::net::UnixListener::bind(place.path().join("a.sock")).unwrap());
+    drop(UnixListener::bind(place.path().join("a.sock")).unwrap());
     place.says(1, &["status", "-c", "node.toml"], "no node runs at a.sock: its socket is left over");
 }
 
