@@ -6,13 +6,14 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
+use serde::Serialize;
 use sgc_diagnosis::check::{WARNING, summary};
-use sgc_node::config;
+use sgc_node::config::{self, ConfigErrors, Origin};
 use sgc_process::ProcessError;
 use sgc_process::style::{self, Line, Tone, Toned};
 
 use crate::environment::environment;
-use crate::error::CliError;
+use crate::error::{CliError, chain, one_line};
 use crate::{files, output};
 
 /// List all mistakes of a configuration, or describe the node that would run with it. Binds no socket.
@@ -28,19 +29,51 @@ pub(crate) struct CheckArgs {
     /// or beside the configuration or the identity
     #[arg(long, value_name = "FILE")]
     fleet: Option<PathBuf>,
-    /// Print the description as JSON: a list of texts for each heading
+    /// Print the description as JSON: a list of texts for each heading. `mistakes` has the mistakes, and is alone if
+    /// there are any
     #[arg(long)]
     json: bool,
+}
+
+/// A mistake as `--json` shows it.
+#[derive(Serialize)]
+struct MistakeJson {
+    /// `None` if the mistake is in a variable of the environment.
+    file: Option<String>,
+    /// Counted from 1; `None` if something is missing from the whole file.
+    line: Option<usize>,
+    mistake: String,
+}
+
+#[derive(Serialize)]
+struct MistakesJson {
+    mistakes: Vec<MistakeJson>,
 }
 
 /// Runs `sgc check`.
 pub(crate) fn check(args: &CheckArgs) -> Result<(), CliError> {
     let path = files::config_here(args.config.as_deref())?;
     let what = path.display().to_string();
-    let config = config::load(&path, &environment)
-        .map_err(|errors| CliError::Config { what: what.clone(), errors })?;
-    let identity = sgc_node::check_identity(&config)
-        .map_err(|source| CliError::CheckIdentity { what: what.clone(), source })?;
+    let config = match config::load(&path, &environment) {
+        Ok(config) => config,
+        Err(errors) => {
+            if args.json {
+                output::json(&MistakesJson { mistakes: mistakes(&errors) })?;
+            }
+            return Err(CliError::Config { what, errors });
+        }
+    };
+    let identity = match sgc_node::check_identity(&config) {
+        Ok(identity) => identity,
+        Err(source) => {
+            if args.json {
+                let mistake = one_line(&chain(&source));
+                let mistake = MistakeJson { file: Some(what.clone()), line: None, mistake };
+                output::json(&MistakesJson { mistakes: vec![mistake] })?;
+            }
+            return Err(CliError::CheckIdentity { what, source });
+        }
+    };
     let summary = summary(&config, &identity, &path, args.fleet.as_deref(), &environment)?;
     if args.json {
         return output::line(json(&summary)?);
@@ -57,9 +90,20 @@ pub(crate) fn check(args: &CheckArgs) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Returns the description as an object with a list of texts for each heading.
+fn mistakes(errors: &ConfigErrors) -> Vec<MistakeJson> {
+    let json = |error: &config::ConfigError| {
+        let (file, line) = match &error.origin {
+            Origin::File { file, line } => (Some(file.to_string()), *line),
+            Origin::Arguments | Origin::Environment => (None, None),
+        };
+        MistakeJson { file, line, mistake: error.mistake.to_string() }
+    };
+    errors.iter().map(json).collect()
+}
+
+/// Returns the description as an object with a list of texts for each heading, and an empty list of mistakes.
 fn json(rows: &[Vec<String>]) -> Result<String, CliError> {
-    let mut all: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    let mut all: BTreeMap<&str, Vec<&str>> = [("mistakes", Vec::new())].into();
     let mut heading = "";
     for row in rows {
         let [kind, text] = &row[..] else { continue };

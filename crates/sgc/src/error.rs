@@ -453,7 +453,7 @@ fn usage_line(text: &str, called: &str) -> String {
 }
 
 /// Formats an error and its sources, each once.
-fn chain(error: &dyn Error) -> String {
+pub(crate) fn chain(error: &dyn Error) -> String {
     let mut text = error.to_string();
     let mut next = error.source();
     while let Some(source) = next {
@@ -466,7 +466,8 @@ fn chain(error: &dyn Error) -> String {
     text
 }
 
-fn one_line(text: &str) -> String {
+/// Joins lines and removes control characters.
+pub(crate) fn one_line(text: &str) -> String {
     output::clean(&text.lines().map(str::trim).collect::<Vec<_>>().join(" "))
 }
 

@@ -721,6 +721,33 @@ fn rate_bandwidth_and_delay_are_printed_as_a_line_of_json_per_report() {
 }
 
 #[test]
+fn check_prints_mistakes_as_json_with_the_same_exit_code() {
+    let place = Place::with_fleet();
+    let check = |code: i32| {
+        let plain = place.run(&["check"]);
+        let ran = place.run(&["check", "--json"]);
+        assert_eq!((ran.code, plain.code), (Some(code), Some(code)), "{}", ran.stderr);
+        assert_eq!(ran.stderr, plain.stderr);
+        serde_json::from_str::<Value>(&ran.stdout).expect(&ran.stdout)
+    };
+    place.write("node.toml", "identity = 'arm-1.identity'\n[node]\nrouters = ['nonsense']\nnames = 3\n");
+    let json = check(2);
+    assert_eq!(json.as_object().unwrap().len(), 1, "{json}");
+    let mistakes = json["mistakes"].as_array().unwrap();
+    let places: Vec<_> = mistakes.iter().map(|m| (m["file"].as_str(), m["line"].as_u64())).collect();
+    assert_eq!(places, [(Some("node.toml"), Some(3)), (Some("node.toml"), Some(4))], "{json}");
+    assert!(mistakes[0]["mistake"].as_str().unwrap().contains("nonsense"), "{json}");
+    // An identity that cannot be used is a mistake as well.
+    place.write("node.toml", "identity = 'absent.identity'\n[node]\nrouters = ['quic://r']\n");
+    let json = check(2);
+    assert_eq!(json["mistakes"].as_array().unwrap().len(), 1);
+    assert!(json["mistakes"][0]["mistake"].as_str().unwrap().contains("absent.identity"), "{json}");
+    place.write("node.toml", "identity = 'arm-1.identity'\n[node]\nrouters = ['quic://r']\n");
+    let json = check(0);
+    assert_eq!((&json["mistakes"], json["node"].is_array()), (&serde_json::json!([]), true), "{json}");
+}
+
+#[test]
 fn validity_in_days_is_refused_with_its_span() {
     let place = Place::with_fleet();
     for verb in ["enroll", "renew"] {
