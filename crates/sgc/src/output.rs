@@ -14,6 +14,11 @@ pub(crate) fn line(text: impl Display) -> Result<(), CliError> {
     Ok(sgc_process::output::line(text)?)
 }
 
+/// Writes a result: as JSON on one line if the user asks for it, else as text.
+pub(crate) fn result(is_json: bool, value: &impl Serialize, text: impl Display) -> Result<(), CliError> {
+    if is_json { json(value) } else { line(text) }
+}
+
 /// Writes a result as JSON on one line.
 pub(crate) fn json(value: &impl Serialize) -> Result<(), CliError> {
     line(serde_json::to_string(value).map_err(|error| ProcessError::Output(error.into()))?)

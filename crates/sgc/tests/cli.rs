@@ -748,6 +748,76 @@ fn check_prints_mistakes_as_json_with_the_same_exit_code() {
 }
 
 #[test]
+fn fleet_commands_print_their_results_as_json() {
+    let place = Place::new();
+    let json = |args: &[&str]| {
+        let said = place.good(&[args, &["--json"]].concat());
+        assert_eq!(said.lines().count(), 1, "{args:?}: {said}");
+        serde_json::from_str::<Value>(&said).expect(&said)
+    };
+    let made = json(&["fleet", "create", "lab", "--authority", "hub"]);
+    assert_eq!((&made["file"], &made["authority"]), (&"lab.fleet".into(), &"hub".into()));
+    assert_eq!(json(&["fleet", "set", "--post-quantum", "true"])["post_quantum"], true);
+
+    let enrolled = json(&["fleet", "enroll", "arm-1"]);
+    let until = place.identity("arm-1.identity").not_after().to_string();
+    let expected = serde_json::json!({
+        "file": "arm-1.identity", "node": "arm-1", "fleet": "lab", "expires": until, "has_key": true,
+    });
+    assert_eq!(enrolled, expected);
+    let requested = json(&["fleet", "request", "desk"]);
+    assert_eq!(
+        requested,
+        serde_json::json!({ "node": "desk", "key_file": "desk.key", "request_file": "desk.csr" })
+    );
+    let answered = json(&["fleet", "enroll", "desk", "--csr", "desk.csr"]);
+    assert_eq!((&answered["file"], &answered["has_key"]), (&"desk.answer".into(), &false.into()));
+    assert_eq!(json(&["fleet", "accept", "desk.answer"])["file"], "desk.identity");
+    let renewed = json(&["fleet", "renew", "desk", "--valid", "1d"]);
+    assert_eq!(renewed["expires"], place.identity("desk.identity").not_after().to_string());
+    assert_eq!(
+        json(&["fleet", "extensions", "arm-2", "--secret", "lab.fleet"]),
+        serde_json::json!({ "node": "arm-2", "file": "arm-2.ext" })
+    );
+
+    let rotated = json(&["fleet", "rotate-secret"]);
+    assert_eq!(rotated["secret_generations"], serde_json::json!([1, 2]));
+    let retired = json(&["fleet", "retire-secret", "2", "--force"]);
+    assert_eq!(retired["secret_generations"], serde_json::json!([2]));
+
+    json(&["fleet", "enroll", "hub"]);
+    let invite = ["fleet", "invite", "new", "--via", "quic://router.lab.example"];
+    let ran = place.run(&[&invite[..], &["--json"]].concat());
+    let invited: Value = serde_json::from_str(&ran.stdout).expect(&ran.stdout);
+    assert_eq!((&invited["node"], &invited["authority"]), (&"new".into(), &"hub".into()));
+    assert_eq!(invited["routers"], serde_json::json!(["quic://router.lab.example"]));
+    let code = sgc_trust::Invitation::parse(invited["code"].as_str().unwrap()).unwrap();
+    assert_eq!(invited["expires"], code.validity().unwrap().1.to_string());
+
+    let copied = json(&["fleet", "backup", "lab.fleet-backup"]);
+    assert_eq!((&copied["file"], &copied["nodes"]), (&"lab.fleet-backup".into(), &4.into()));
+    place.says(
+        2,
+        &["fleet", "backup", "-", "--json"],
+        "the copy goes to standard output: leave --json out, or name a file",
+    );
+    let revoked = json(&["fleet", "revoke", "arm-1"]);
+    assert_eq!(revoked["nodes"], serde_json::json!(["arm-1"]));
+    assert_eq!((&revoked["revocation_list_file"], &revoked["authority"]), (&"lab.crl".into(), &Value::Null));
+    assert_eq!(revoked["pushed_to"], serde_json::json!([]));
+
+    let restored = json(&["fleet", "restore", "lab.fleet-backup", "--fleet", "copy.fleet"]);
+    assert_eq!(restored["ended_invitations"], serde_json::json!(["new"]));
+    let merged = json(&["fleet", "merge", "lab.crl", "--fleet", "copy.fleet"]);
+    assert_eq!((&merged["revoked"], &merged["settings"]), (&serde_json::json!(["arm-1"]), &false.into()));
+    json(&["fleet", "enroll", "arm-3", "--fleet", "lab.fleet"]);
+    let merged = json(&["fleet", "merge", "lab.fleet", "--fleet", "copy.fleet"]);
+    assert_eq!(merged["enrolled"], serde_json::json!(["arm-3"]));
+    let adopted = ["fleet", "adopt", "desk", "--certificate", "desk.identity", "--fleet", "lab.fleet"];
+    assert_eq!(json(&adopted), serde_json::json!({ "file": "lab.fleet", "node": "desk" }));
+}
+
+#[test]
 fn validity_in_days_is_refused_with_its_span() {
     let place = Place::with_fleet();
     for verb in ["enroll", "renew"] {

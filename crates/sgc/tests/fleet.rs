@@ -859,7 +859,14 @@ fn a_machine_joins_with_a_code_and_the_code_is_good_once() {
     assert!(refused(&["join", "--dir", "missing", &spare], 1).contains("missing"));
     assert!(refused(&["join", "--service", "../robot", &spare], 2).contains("'/'"));
     fs::create_dir(place.path("other")).unwrap();
-    place.good(&["join", "--dir", "other", &spare]);
+    let joined: serde_json::Value =
+        serde_json::from_str(&place.good(&["join", "--dir", "other", "--json", &spare])).unwrap();
+    let until = place.identity("other/cloud-2.identity").not_after().to_string();
+    let expected = serde_json::json!({
+        "node": "cloud-2", "fleet": "lab", "expires": until, "identity_file": "other/cloud-2.identity",
+        "config_file": "other/cloud-2.toml", "config_is_new": true, "service": null,
+    });
+    assert_eq!(joined, expected);
     assert!(place.good(&["check", "-c", "other/cloud-2.toml"]).contains("no mistakes"));
     assert!(place.read("other/cloud-2.toml").contains("[router]\nlisten = "));
     assert_eq!(fs::read_dir(place.path("other")).unwrap().count(), 2, "nothing unfinished is left");

@@ -4,6 +4,7 @@ use std::io::{IsTerminal as _, Read as _};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use serde::Serialize;
 use sgc_node::LockedFleet;
 use sgc_process::{ProcessError, unix_now};
 use sgc_trust::{FLEET_FILE_BYTES_MAX, Fleet, NodeName};
@@ -31,6 +32,9 @@ pub(super) struct BackupArgs {
     /// Replace an existing file
     #[arg(long)]
     force: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// Make the fleet file from a copy, where there is none.
@@ -43,6 +47,34 @@ pub(super) struct RestoreArgs {
     /// Fleet file to make [default: FLEET.fleet]
     #[arg(long, value_name = "FILE")]
     fleet: Option<PathBuf>,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// A written copy, or the file that was made from one, as `--json` shows it.
+#[derive(Serialize)]
+struct CopyJson<'a> {
+    file: String,
+    fleet: &'a str,
+    /// Number of nodes in the roster.
+    nodes: usize,
+    /// The time of the last change.
+    changed: String,
+    /// Nodes whose open invitations ended, because a copy does not know whether they were used.
+    ended_invitations: Vec<&'a str>,
+}
+
+impl<'a> CopyJson<'a> {
+    fn new(path: &Path, fleet: &'a Fleet, invited: &'a [NodeName]) -> Self {
+        Self {
+            file: path.display().to_string(),
+            fleet: fleet.name().as_str(),
+            nodes: fleet.nodes().len(),
+            changed: changed(fleet).to_string(),
+            ended_invitations: invited.iter().map(NodeName::as_str).collect(),
+        }
+    }
 }
 
 pub(super) fn backup(args: &BackupArgs) -> Result<(), CliError> {
@@ -50,6 +82,11 @@ pub(super) fn backup(args: &BackupArgs) -> Result<(), CliError> {
     let fleet = LockedFleet::open(&args.which.path()?)?.fleet;
     let text = fleet.to_text();
     if args.out.as_deref() == Some(Path::new(STANDARD_STREAM)) {
+        if args.json {
+            return Err(CliError::Cannot {
+                reason: "the copy goes to standard output: leave --json out, or name a file".to_owned(),
+            });
+        }
         if std::io::stdout().is_terminal() {
             return Err(CliError::Cannot {
                 reason: "the copy is a secret, and standard output is a terminal: name a file, or a program behind a |"
@@ -63,7 +100,8 @@ pub(super) fn backup(args: &BackupArgs) -> Result<(), CliError> {
     let out = args.out.clone().unwrap_or_else(default);
     let existing = if args.force { Existing::Replace } else { Existing::Keep("; --force replaces it") };
     files::write_secret(&out, &text, existing)?;
-    output::line(format!("{}: {}", out.display(), content_text(&fleet)))
+    let text = format!("{}: {}", out.display(), content_text(&fleet));
+    output::result(args.json, &CopyJson::new(&out, &fleet, &[]), text)
 }
 
 pub(super) fn restore(args: &RestoreArgs) -> Result<(), CliError> {
@@ -77,14 +115,15 @@ pub(super) fn restore(args: &RestoreArgs) -> Result<(), CliError> {
     let path = args.fleet.clone().unwrap_or_else(|| PathBuf::from(format!("{}.fleet", fleet.name())));
     let hint = "; what it lacks comes from a copy by `sgc fleet merge COPY`";
     files::write_secret(&path, &fleet.to_text(), Existing::Keep(hint))?;
-    output::line(format!(
+    let text = format!(
         "{}: {}\nNodes that were enrolled after the copy was made are not in it: they run on, and cannot be renewed or \
          revoked until `sgc fleet adopt NODE --certificate NODE.identity` enters them. Later revocations stay in force: \
          `sgc fleet merge LIST.crl`, or the start of the authority, brings them here.{}",
         path.display(),
         content_text(&fleet),
         ended_text(&invited)
-    ))
+    );
+    output::result(args.json, &CopyJson::new(&path, &fleet, &invited), text)
 }
 
 /// Tells which invitations ended. A copy does not know whether they were used.
@@ -106,8 +145,12 @@ fn read_standard_input() -> Result<Zeroizing<String>, CliError> {
 
 /// Describes a fleet, and how old its roster is.
 fn content_text(fleet: &Fleet) -> String {
+    format!("fleet {}, {} nodes, last changed {}", fleet.name(), fleet.nodes().len(), changed(fleet))
+}
+
+/// Returns the time of the last change of a fleet.
+fn changed(fleet: &Fleet) -> UnixMillis {
     let changes = fleet.nodes().flat_map(|node| [Some(node.changed), node.seen]).flatten();
     let made = fleet.generations().iter().map(|generation| generation.created);
-    let last = changes.chain(made).max().unwrap_or(UnixMillis(0));
-    format!("fleet {}, {} nodes, last changed {last}", fleet.name(), fleet.nodes().len())
+    changes.chain(made).max().unwrap_or(UnixMillis(0))
 }

@@ -5,6 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use serde::Serialize;
 use sgc_node::LockedFleet;
 use sgc_process::{ProcessError, unix_now};
 use sgc_transport::LinkUrl;
@@ -30,6 +31,31 @@ pub(super) struct MergeArgs {
     routers: Vec<LinkUrl>,
     #[command(flatten)]
     which: WhichFleet,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The result of `sgc fleet merge` as `--json` shows it.
+#[derive(Serialize)]
+struct MergeJson<'a> {
+    file: String,
+    /// Nodes that were not revoked here before.
+    revoked: &'a [String],
+    enrolled: Vec<&'a str>,
+    changed: Vec<&'a str>,
+    /// Generations of the secret that are new here.
+    secret_generations: &'a [u32],
+    /// Generations whose secret here was replaced by that of the other copy.
+    replaced_generations: &'a [u32],
+    /// The settings of the fleet changed.
+    settings: bool,
+    /// The other copy lacks something that this one has.
+    other_is_behind: bool,
+    revocation_list: u64,
+    revocation_list_file: String,
+    /// Nodes and routers to which the list was pushed.
+    pushed_to: &'a [String],
 }
 
 pub(super) fn merge(args: &MergeArgs) -> Result<(), CliError> {
@@ -42,22 +68,25 @@ pub(super) fn merge(args: &MergeArgs) -> Result<(), CliError> {
     let now = unix_now();
     let (mine, theirs) = (path.display(), args.other.display());
     let mut text = String::new();
+    let (mut gained, mut other_is_behind) = (MergeReport::default(), false);
     if args.other.extension().is_some_and(|e| e == LIST_EXTENSION) {
         let absorbed = take_list(&mut file.fleet, &args.other, now)?;
         text.push_str(&match absorbed.revoked.is_empty() {
             true => format!("{mine}: knows everything that {theirs} does\n"),
             false => format!("{mine}: took over from {theirs}\n  revoked: {}\n", absorbed.revoked.join(", ")),
         });
+        gained.revoked = absorbed.revoked;
     } else {
         let mut other = sgc_node::read_fleet(&args.other)?;
         let done = file.fleet.merge(&other, now);
-        let gained = done.map_err(|source| CliError::Fleet { path: args.other.clone(), source })?;
+        gained = done.map_err(|source| CliError::Fleet { path: args.other.clone(), source })?;
         text.push_str(&match gained == MergeReport::default() {
             true => format!("{mine}: knows everything that {theirs} does\n"),
             false => format!("{mine}: took over from {theirs}\n{}", gained_text(&gained)),
         });
         let lacked = other.merge(&file.fleet, now).map_err(|source| file.error(source))?;
-        if lacked != MergeReport::default() {
+        other_is_behind = lacked != MergeReport::default();
+        if other_is_behind {
             text.push_str(&format!(
                 "{theirs} is older or went its own way: put a copy of {mine} in its place.\n"
             ));
@@ -70,7 +99,20 @@ pub(super) fn merge(args: &MergeArgs) -> Result<(), CliError> {
     if !pushed.names.is_empty() {
         text.push_str(&format!("Pushed to {}: nodes pass it on to each other.\n", pushed.names.join(", ")));
     }
-    output::line(text.trim_end())?;
+    let json = MergeJson {
+        file: path.display().to_string(),
+        revoked: &gained.revoked,
+        enrolled: gained.enrolled.iter().map(NodeName::as_str).collect(),
+        changed: gained.changed.iter().map(NodeName::as_str).collect(),
+        secret_generations: &gained.generations,
+        replaced_generations: &gained.replaced,
+        settings: gained.settings,
+        other_is_behind,
+        revocation_list: file.fleet.crl_number(),
+        revocation_list_file: list_path.display().to_string(),
+        pushed_to: &pushed.names,
+    };
+    output::result(args.json, &json, text.trim_end())?;
     pushed.failed.map_or(Ok(()), Err)
 }
 

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{ArgAction, Args};
 use rustls_pki_types::CertificateDer;
+use serde::Serialize;
 use sgc_diagnosis::check::FLEET_EXTENSION;
 use sgc_process::{system_rng, unix_now};
 use sgc_trust::{Fleet, FleetName, NodeName, pem_contents};
@@ -65,6 +66,9 @@ pub(super) struct SetArgs {
     /// Make links and grants resist quantum computers, or not
     #[arg(long, value_name = "true|false", action = ArgAction::Set)]
     post_quantum: Option<bool>,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 #[derive(Debug, Args)]
@@ -75,6 +79,32 @@ struct Traits {
     /// Make links and grants resist quantum computers
     #[arg(long)]
     post_quantum: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// A fleet and its settings, as `--json` shows them.
+#[derive(Serialize)]
+struct FleetJson<'a> {
+    file: String,
+    fleet: &'a str,
+    /// The end of the CA's certificate.
+    expires: String,
+    authority: Option<&'a str>,
+    post_quantum: bool,
+}
+
+impl<'a> FleetJson<'a> {
+    fn new(fleet: &'a Fleet, path: &Path) -> Self {
+        Self {
+            file: path.display().to_string(),
+            fleet: fleet.name().as_str(),
+            expires: fleet.not_after().to_string(),
+            authority: fleet.authority().map(NodeName::as_str),
+            post_quantum: fleet.post_quantum(),
+        }
+    }
 }
 
 pub(super) fn create(args: &CreateArgs) -> Result<(), CliError> {
@@ -125,12 +155,13 @@ pub(super) fn set(args: &SetArgs) -> Result<(), CliError> {
         done.map_err(|e| file.error(e))?;
     }
     file.save()?;
-    output::line(format!(
+    let text = format!(
         "{}: authority {}, post-quantum {}\nNodes learn it when they are enrolled or renewed.",
         file.path().display(),
         file.fleet.authority().map_or("none", NodeName::as_str),
         if file.fleet.post_quantum() { "on" } else { "off" },
-    ))
+    );
+    output::result(args.json, &FleetJson::new(&file.fleet, file.path()), text)
 }
 
 fn file_of(name: &FleetName, dir: &Path) -> PathBuf {
@@ -148,7 +179,7 @@ fn finish(mut fleet: Fleet, traits: &Traits, path: &Path) -> Result<(), CliError
         fleet.set_post_quantum(true, unix_now()).map_err(failed)?;
     }
     files::write_secret(path, &fleet.to_text(), Existing::Keep(KEPT))?;
-    output::line(created_text(&fleet, path))
+    output::result(traits.json, &FleetJson::new(&fleet, path), created_text(&fleet, path))
 }
 
 fn created_text(fleet: &Fleet, path: &Path) -> String {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use clap::Args;
+use serde::Serialize;
 use sgc_node::LockedFleet;
 use sgc_process::{ProcessError, system_rng, unix_now};
 use sgc_trust::{
@@ -70,6 +71,43 @@ struct OutputArgs {
     /// Replace an existing file
     #[arg(long)]
     force: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// A written identity, or the answer to a request, as `--json` shows it.
+#[derive(Serialize)]
+struct CertifiedJson<'a> {
+    file: String,
+    node: &'a str,
+    fleet: &'a str,
+    /// The end of the certificate; `None` for the answer to a request.
+    expires: Option<String>,
+    /// Whether the file has the private key; the answer to a request has none.
+    has_key: bool,
+}
+
+impl<'a> CertifiedJson<'a> {
+    fn identity(path: &Path, identity: &'a Identity) -> Self {
+        Self {
+            file: path.display().to_string(),
+            node: identity.node_name().as_str(),
+            fleet: identity.fleet_name().as_str(),
+            expires: Some(identity.not_after().to_string()),
+            has_key: true,
+        }
+    }
+
+    fn answer(path: &Path, member: &'a Membership) -> Self {
+        Self {
+            file: path.display().to_string(),
+            node: member.node_name().as_str(),
+            fleet: member.fleet_name().as_str(),
+            expires: None,
+            has_key: false,
+        }
+    }
 }
 
 impl OutputArgs {
@@ -166,7 +204,8 @@ pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
         args.output.check_free(&path)?;
         let member = keeper.enroll(&read_csr(csr)?, &request)?;
         files::write_secret(&path, &member.to_text(), args.output.existing())?;
-        return output::line(answered_text(&request.node, &path));
+        let text = answered_text(&request.node, &path);
+        return output::result(args.output.json, &CertifiedJson::answer(&path, &member), text);
     }
     let path = args.output.path(&request.node, "identity");
     args.output.check_free(&path)?;
@@ -174,7 +213,8 @@ pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
     let member = keeper.enroll(key.csr(), &request)?;
     let identity = with_key(member, &key, &path)?;
     files::write_secret(&path, &identity.to_text(), args.output.existing())?;
-    output::line(enrolled_text(&identity, &request, &path))
+    let text = enrolled_text(&identity, &request, &path);
+    output::result(args.output.json, &CertifiedJson::identity(&path, &identity), text)
 }
 
 pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
@@ -186,7 +226,8 @@ pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
         args.output.check_free(&path)?;
         let member = keeper.renew(&read_csr(csr)?, &node, valid)?;
         files::write_secret(&path, &member.to_text(), args.output.existing())?;
-        return output::line(answered_text(&node, &path));
+        let text = answered_text(&node, &path);
+        return output::result(args.output.json, &CertifiedJson::answer(&path, &member), text);
     }
     let path = args.output.path(&node, "identity");
     let old = if files::exists(&path) { Some(sgc_node::load_identity(&path)?) } else { None };
@@ -212,7 +253,8 @@ pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
         }
     };
     files::write_secret(&path, &new.to_text(), Existing::Replace)?;
-    output::line(renewed_text(&path, &node, new.not_after()))
+    let text = renewed_text(&path, &node, new.not_after());
+    output::result(args.output.json, &CertifiedJson::identity(&path, &new), text)
 }
 
 /// Makes a key for a node here, so that no authority ever has it.

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use serde::Serialize;
 use sgc_diagnosis::ask;
 use sgc_node::config::RouterUrl;
 use sgc_process::system_rng;
@@ -39,6 +40,21 @@ pub(super) struct InviteArgs {
     /// repeated [default: those of your node that runs here]
     #[arg(long, value_name = "URL")]
     via: Vec<String>,
+    /// Print the code, its end and what it names as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// An invitation as `--json` shows it.
+#[derive(Serialize)]
+struct InvitationJson<'a> {
+    node: &'a str,
+    fleet: &'a str,
+    authority: &'a str,
+    routers: &'a [String],
+    /// The end of the code.
+    expires: String,
+    code: &'a str,
 }
 
 pub(super) fn invite(args: &InviteArgs) -> Result<(), CliError> {
@@ -66,7 +82,17 @@ pub(super) fn invite(args: &InviteArgs) -> Result<(), CliError> {
         }
     };
     output::diagnostic(&invited_text(&invitation)?);
-    output::line(invitation.to_text().as_str())
+    let (_, until) = invitation.validity().map_err(CliError::Invitation)?;
+    let code = invitation.to_text();
+    let json = InvitationJson {
+        node: invitation.node.as_str(),
+        fleet: invitation.fleet.as_str(),
+        authority: invitation.authority.as_str(),
+        routers: &invitation.routers,
+        expires: until.to_string(),
+        code: code.as_str(),
+    };
+    output::result(args.json, &json, code.as_str())
 }
 
 /// Returns the routers that the code names: as asked, or those of the node that runs here.

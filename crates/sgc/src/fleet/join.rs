@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use clap::Args;
+use serde::Serialize;
 use sgc_diagnosis::{DiagnosisError, ask};
 use sgc_node::config::{ArgsConfig, Config, load_args};
 use sgc_node::graph::Graph;
@@ -71,6 +72,24 @@ pub(crate) struct JoinArgs {
     /// Replace an existing identity
     #[arg(long)]
     force: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The node that this machine became, as `--json` shows it.
+#[derive(Serialize)]
+struct JoinedJson<'a> {
+    node: &'a str,
+    fleet: &'a str,
+    /// The end of the certificate.
+    expires: String,
+    identity_file: String,
+    config_file: String,
+    /// Whether the configuration was made; an existing one stays as it is.
+    config_is_new: bool,
+    /// The service to start, `sgc@NAME`.
+    service: Option<String>,
 }
 
 /// A code as the user gave it. Debug shows nothing.
@@ -145,7 +164,16 @@ pub(crate) fn join(args: JoinArgs) -> Result<(), CliError> {
         let text = config_text(&identity, &places, routers, is_router);
         file.commit(text.as_bytes(), PUBLIC_MODE, Existing::Keep(""))?;
     }
-    output::line(joined_text(&identity, &places, is_new))
+    let json = JoinedJson {
+        node: identity.node_name().as_str(),
+        fleet: identity.fleet_name().as_str(),
+        expires: identity.not_after().to_string(),
+        identity_file: places.identity.display().to_string(),
+        config_file: places.config.display().to_string(),
+        config_is_new: is_new,
+        service: places.service.as_ref().map(|service| format!("sgc@{service}")),
+    };
+    output::result(args.json, &json, joined_text(&identity, &places, is_new))
 }
 
 /// Reads the code from standard input.

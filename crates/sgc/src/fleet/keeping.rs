@@ -58,6 +58,9 @@ pub(super) struct RevokeArgs {
     routers: Vec<LinkUrl>,
     #[command(flatten)]
     place: FleetPlace,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// Enter a certificate that is older than the fleet's roster into the roster, so that it can be revoked.
@@ -70,6 +73,9 @@ pub(super) struct AdoptArgs {
     certificate: PathBuf,
     #[command(flatten)]
     which: WhichFleet,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// Make a new generation of the secret from which names are derived.
@@ -80,6 +86,9 @@ pub(super) struct AdoptArgs {
 pub(super) struct RotateArgs {
     #[command(flatten)]
     which: WhichFleet,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// Take old generations of the naming secret out of use, once every node has a newer one.
@@ -93,6 +102,44 @@ pub(super) struct RetireArgs {
     force: bool,
     #[command(flatten)]
     which: WhichFleet,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The result of `sgc fleet revoke` as `--json` shows it.
+#[derive(Serialize)]
+struct RevokedJson<'a> {
+    /// The revoked nodes; none if the list was only written again.
+    nodes: Vec<&'a str>,
+    /// Number of the list.
+    revocation_list: u64,
+    /// The written list; `None` if the authority keeps it.
+    revocation_list_file: Option<String>,
+    /// The authority that revoked; `None` with a fleet file.
+    authority: Option<&'a str>,
+    /// Nodes and routers to which the list was pushed from here.
+    pushed_to: &'a [String],
+}
+
+#[derive(Serialize)]
+struct AdoptedJson<'a> {
+    file: String,
+    node: &'a str,
+}
+
+/// Generations of a fleet's secret after a change, as `--json` shows them.
+#[derive(Serialize)]
+struct GenerationsJson {
+    file: String,
+    secret_generations: Vec<u32>,
+}
+
+impl GenerationsJson {
+    fn new(file: &LockedFleet) -> Self {
+        let secret_generations = file.fleet.generations().iter().map(|g| g.number).collect();
+        Self { file: file.path().display().to_string(), secret_generations }
+    }
 }
 
 #[derive(Serialize)]
@@ -167,7 +214,7 @@ pub(super) fn ca(args: &CaArgs) -> Result<(), CliError> {
 pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     let nodes = args.nodes.iter().map(|n| n.parse()).collect::<Result<Vec<NodeName>, _>>()?;
     if let Some(remote) = args.place.remote()? {
-        return revoke_at(&remote, &nodes);
+        return revoke_at(&remote, &nodes, args.json);
     }
     let mut file = args.place.which.open()?;
     let now = unix_now();
@@ -192,18 +239,32 @@ pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
             text.push_str(&format!("Pushed to {}: nodes pass it on to each other.", pushed.names.join(", ")))
         }
     }
-    output::line(text)?;
+    let json = RevokedJson {
+        nodes: nodes.iter().map(NodeName::as_str).collect(),
+        revocation_list: file.fleet.crl_number(),
+        revocation_list_file: Some(path.display().to_string()),
+        authority: None,
+        pushed_to: &pushed.names,
+    };
+    output::result(args.json, &json, text)?;
     pushed.failed.map_or(Ok(()), Err)
 }
 
-fn revoke_at(remote: &Remote, nodes: &[NodeName]) -> Result<(), CliError> {
+fn revoke_at(remote: &Remote, nodes: &[NodeName], is_json: bool) -> Result<(), CliError> {
     let list = remote.revoke(nodes)?;
     let mut text = String::new();
     for node in nodes {
         text.push_str(&format!("{node}: revoked\n"));
     }
     text.push_str(&format!("Revocation list {list} of {}: nodes pass it on to each other.", remote.at()));
-    output::line(text)
+    let json = RevokedJson {
+        nodes: nodes.iter().map(NodeName::as_str).collect(),
+        revocation_list: list,
+        revocation_list_file: None,
+        authority: Some(remote.at().as_str()),
+        pushed_to: &[],
+    };
+    output::result(is_json, &json, text)
 }
 
 pub(super) fn adopt(args: &AdoptArgs) -> Result<(), CliError> {
@@ -216,7 +277,9 @@ pub(super) fn adopt(args: &AdoptArgs) -> Result<(), CliError> {
     let done = file.fleet.adopt(node.clone(), &chain, unix_now());
     done.map_err(|source| CliError::Fleet { path: path.clone(), source })?;
     file.save()?;
-    output::line(format!("{}: knows this certificate of {node} now", file.path().display()))
+    let path = file.path().display();
+    let json = AdoptedJson { file: path.to_string(), node: node.as_str() };
+    output::result(args.json, &json, format!("{path}: knows this certificate of {node} now"))
 }
 
 pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
@@ -227,12 +290,13 @@ pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
     // An authority that runs here reads the fleet file again when it gets a list.
     let (_, list) = write_list(&file, unix_now())?;
     push_crl(&mut file, &list, &[])?;
-    output::line(format!(
+    let text = format!(
         "{}: generation {generation} of the naming secret\n\
          Nodes get it when they are renewed (`sgc fleet renew NODE`, or by the authority). Once all have it:\n  \
          sgc fleet retire-secret {generation}",
         file.path().display()
-    ))
+    );
+    output::result(args.json, &GenerationsJson::new(&file), text)
 }
 
 pub(super) fn retire(args: &RetireArgs) -> Result<(), CliError> {
@@ -246,7 +310,8 @@ pub(super) fn retire(args: &RetireArgs) -> Result<(), CliError> {
     done.map_err(|e| file.error(e))?;
     file.save()?;
     let left: Vec<_> = file.fleet.generations().iter().map(|g| g.number.to_string()).collect();
-    output::line(format!("{}: generations in use: {}", file.path().display(), left.join(", ")))
+    let text = format!("{}: generations in use: {}", file.path().display(), left.join(", "));
+    output::result(args.json, &GenerationsJson::new(&file), text)
 }
 
 /// Returns the newest generation of a fleet's secret.

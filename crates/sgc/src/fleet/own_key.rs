@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use rustls_pki_types::CertificateDer;
+use serde::Serialize;
 use sgc_process::system_rng;
 use sgc_trust::{
     FleetName, FleetSecret, GroupName, Identity, Import, KeyRequest, Membership, NodeName, certificate_uris,
@@ -33,6 +34,9 @@ pub(super) struct RequestArgs {
     /// Directory for the two files
     #[arg(long, value_name = "DIR", default_value = ".")]
     dir: PathBuf,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// On a node's machine: make its identity from its key and the answer to its request.
@@ -67,6 +71,9 @@ pub(super) struct AcceptArgs {
     /// Replace an existing identity
     #[arg(long)]
     force: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// For a CA that does not know SGC: write the extensions of a node's certificate.
@@ -88,6 +95,34 @@ pub(super) struct ExtensionsArgs {
     /// File for the extensions [default: NODE.ext]
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct RequestJson<'a> {
+    node: &'a str,
+    key_file: String,
+    request_file: String,
+}
+
+#[derive(Serialize)]
+struct ExtensionsJson<'a> {
+    node: &'a str,
+    file: String,
+}
+
+/// The identity that `sgc fleet accept` wrote, as `--json` shows it.
+#[derive(Serialize)]
+struct AcceptedJson<'a> {
+    file: String,
+    node: &'a str,
+    fleet: &'a str,
+    /// The end of the certificate.
+    expires: String,
+    /// Limits of the certificate on some transports.
+    notes: Vec<&'static str>,
 }
 
 pub(super) fn extensions(args: &ExtensionsArgs) -> Result<(), CliError> {
@@ -109,11 +144,13 @@ pub(super) fn extensions(args: &ExtensionsArgs) -> Result<(), CliError> {
         groups.iter().for_each(|group| accept.push_str(&format!(" --group {group}")));
         accept.push_str(if may_route { " --may-route" } else { "" });
     }
-    output::line(format!(
+    let json = ExtensionsJson { node: node.as_str(), file: file.to_string() };
+    let text = format!(
         "{file}: extensions for the certificate of {node}, no secret. Where the CA is:\n  \
          openssl x509 -req -in {node}.csr -CA CA.pem -CAkey CA.key -extfile {file} -days 90 -out {node}.pem\n\
          Then, on the node's machine:\n  {accept}"
-    ))
+    );
+    output::result(args.json, &json, text)
 }
 
 fn extensions_text(node: &NodeName, groups: &[GroupName], may_route: bool, uris: &[String]) -> String {
@@ -150,7 +187,8 @@ pub(super) fn request(args: &RequestArgs) -> Result<(), CliError> {
     files::write_secret(&key_path, &made.key_text(), Existing::Keep(KEY_KEPT))?;
     files::write_public(&csr_path, made.csr_text().as_bytes())?;
     let (key, csr) = (key_path.display(), csr_path.display());
-    output::line(match pseudonym {
+    let json = RequestJson { node: node.as_str(), key_file: key.to_string(), request_file: csr.to_string() };
+    let text = match pseudonym {
         None => format!(
             "{key}: the private key of {node}; it stays here\n\
              {csr}: the request, no secret; where the fleet is kept:\n  \
@@ -162,7 +200,8 @@ pub(super) fn request(args: &RequestArgs) -> Result<(), CliError> {
              {node}` writes. Then, here:\n  \
              sgc fleet accept CERTIFICATE --ca CA --node {node} --fleet-name NAME --secret FILE"
         ),
-    })
+    };
+    output::result(args.json, &json, text)
 }
 
 pub(super) fn accept(args: &AcceptArgs) -> Result<(), CliError> {
@@ -207,7 +246,14 @@ pub(super) fn accept(args: &AcceptArgs) -> Result<(), CliError> {
         text.push_str("\nNote: ");
         text.push_str(note);
     }
-    output::line(text)
+    let json = AcceptedJson {
+        file: path.display().to_string(),
+        node: node.as_str(),
+        fleet: identity.fleet_name().as_str(),
+        expires: identity.not_after().to_string(),
+        notes: identity.transport_notes(),
+    };
+    output::result(args.json, &json, text)
 }
 
 impl AcceptArgs {
