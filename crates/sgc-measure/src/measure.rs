@@ -81,7 +81,9 @@ pub struct MeasureOptions {
     /// Duration of each measurement in seconds.
     pub seconds: u32,
     /// File for the figures as JSON.
-    pub json: Option<PathBuf>,
+    pub json_file: Option<PathBuf>,
+    /// Whether the figures are printed as JSON instead of as a table.
+    pub prints_json: bool,
     /// File for the tables as Markdown.
     pub markdown: Option<PathBuf>,
 }
@@ -107,9 +109,6 @@ pub fn measure(args: &MeasureOptions) -> Result<(), MeasureError> {
     // A failure is ignored: the other side may be gone already.
     let _ = measure_side.say(&Ask::Bye);
     drop(measure_side);
-    for line in report.lines() {
-        output::line(line)?;
-    }
     let text = || {
         serde_json::to_string_pretty(&report)
             .map_err(|e| ProcessError::System { what: "cannot write the figures", source: e.into() })
@@ -117,7 +116,12 @@ pub fn measure(args: &MeasureOptions) -> Result<(), MeasureError> {
     let write = |path: &PathBuf, text: String| {
         std::fs::write(path, text).map_err(|source| ProcessError::Write { path: path.clone(), source })
     };
-    if let Some(path) = &args.json {
+    if args.prints_json {
+        output::line(text()?)?;
+    } else {
+        report.lines().into_iter().try_for_each(output::line)?;
+    }
+    if let Some(path) = &args.json_file {
         write(path, text()? + "\n")?;
     }
     if let Some(path) = &args.markdown {

@@ -85,8 +85,12 @@ pub(crate) struct MeasureArgs {
     /// File for the figures as JSON
     #[arg(long, value_name = "FILE")]
     json_file: Option<PathBuf>,
-    #[arg(long, value_name = "FILE", hide = true)]
-    json: Option<String>,
+    /// Print the figures as JSON instead of the table
+    #[arg(long)]
+    json: bool,
+    /// The file of an earlier `--json FILE`.
+    #[arg(hide = true)]
+    moved_json_file: Option<String>,
     /// File for the tables as Markdown
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
@@ -103,8 +107,14 @@ pub(crate) fn bench(args: BenchArgs) -> Result<ExitCode, CliError> {
             if let Some(seconds) = args.seconds {
                 return Err(moved(format!("--seconds {seconds}"), format!("--duration {seconds}s")));
             }
-            if let Some(file) = args.json {
-                return Err(moved(format!("--json {file}"), format!("--json-file {file}")));
+            match args.moved_json_file {
+                Some(file) if args.json => {
+                    return Err(moved(format!("--json {file}"), format!("--json-file {file}")));
+                }
+                Some(other) => {
+                    return Err(CliError::Cannot { reason: format!("unexpected argument '{other}'") });
+                }
+                None => {}
             }
             let options = MeasureOptions {
                 identity: args.identity,
@@ -114,7 +124,8 @@ pub(crate) fn bench(args: BenchArgs) -> Result<ExitCode, CliError> {
                 suites: args.suites,
                 sizes: args.sizes,
                 seconds: args.duration,
-                json: args.json_file,
+                json_file: args.json_file,
+                prints_json: args.json,
                 markdown: args.markdown,
             };
             sgc_measure::measure(&options)?;

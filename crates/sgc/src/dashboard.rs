@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use serde::Serialize;
 use sgc_dashboard::{DASHBOARD_PORT, DashboardOptions, PageUrls};
 
 use crate::error::CliError;
@@ -29,6 +30,18 @@ pub(crate) struct DashboardArgs {
     operate: bool,
     #[command(flatten)]
     node: NodeArgs,
+    /// Print the URLs as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The URLs of the page as `--json` shows them.
+#[derive(Serialize)]
+struct UrlsJson {
+    /// The URL with which the page only looks.
+    look: String,
+    /// The URL with which it also revokes nodes; `None` without `--operate`.
+    operate: Option<String>,
 }
 
 /// Runs `sgc dashboard`.
@@ -46,12 +59,14 @@ pub(crate) fn dashboard(args: &DashboardArgs) -> Result<(), CliError> {
         };
         options.revoke = Some(Box::new(revoke));
     }
-    match sgc_dashboard::run(options, |PageUrls { look, operate }| {
+    let is_json = args.json;
+    match sgc_dashboard::run(options, move |PageUrls { look, operate }| {
         let lines = match operate {
             None => look.clone(),
             Some(operate) => format!("{operate}\nto look only: {look}"),
         };
+        let json = UrlsJson { look: look.clone(), operate: operate.clone() };
         // Without a reader the URL is lost, and the page serves nobody.
-        let _ = output::line(lines);
+        let _ = output::result(is_json, &json, lines);
     })? {}
 }

@@ -19,6 +19,15 @@ pub(crate) fn result(is_json: bool, value: &impl Serialize, text: impl Display) 
     if is_json { json(value) } else { line(text) }
 }
 
+/// Writes a line that accompanies a result. With JSON, standard output has the result alone.
+pub(crate) fn remark(is_json: bool, text: &str) -> Result<(), CliError> {
+    if is_json {
+        diagnostic(text);
+        return Ok(());
+    }
+    line(text)
+}
+
 /// Writes a result as JSON on one line.
 pub(crate) fn json(value: &impl Serialize) -> Result<(), CliError> {
     line(serde_json::to_string(value).map_err(|error| ProcessError::Output(error.into()))?)

@@ -51,6 +51,9 @@ struct CallArgs {
     timeout: Duration,
     #[command(flatten)]
     node: NodeArgs,
+    /// Print the reply as JSON, which is the default
+    #[arg(long)]
+    json: bool,
 }
 
 /// Runs `sgc service`.
@@ -68,6 +71,7 @@ pub(crate) fn service(args: &ServiceArgs) -> Result<ExitCode, CliError> {
     let socket = args.node.socket()?;
     let patience = args.timeout.saturating_add(ANSWER_MAX);
     let text = ask(&socket, &AdminRequest::Call(wish), patience)?;
+    // The reply has one form, with and without --json.
     let reply: Box<RawValue> = answer(&socket, &text)?;
     output::line(reply)?;
     Ok(ExitCode::SUCCESS)

@@ -221,9 +221,9 @@ fn through_a_router_all_but_the_bare_path_is_measured() {
     let answer = lab.answer(&["--router", url]);
     answer.said("desk waits at ");
     let args = ["--with", "desk", "--router", url, "--sizes", "16", "--duration", "1s", "--suites", "group"];
-    let output = lab.run("robot.identity", &[&args[..], &["--json-file", "run.json"]].concat());
+    let output = lab.run("robot.identity", &[&args[..], &["--json"]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
-    let report: Value = serde_json::from_slice(&fs::read(lab.dir.path().join("run.json")).unwrap()).unwrap();
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     check(&report, &["sgc group"], &[], &[16]);
     for not in ["bare_not", "direct_not"] {
         assert!(report[not].as_str().unwrap().contains("through a router"), "{report}");

@@ -867,6 +867,54 @@ fn example_configurations_of_the_package_have_no_mistakes() {
 }
 
 #[test]
+fn dashboard_prints_its_urls_as_json() {
+    let place = Place::new();
+    for (operate, has_second) in [(&["--operate"][..], true), (&[], false)] {
+        let args = ["dashboard", "--json", "--socket", "x.sock", "--listen", "127.0.0.1:0"];
+        let mut command = place.command(&[&args[..], operate].concat());
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        child.kill().unwrap();
+        child.wait().unwrap();
+        let urls: Value = serde_json::from_str(&line).expect(&line);
+        assert!(urls["look"].as_str().unwrap().starts_with("http://127.0.0.1:"), "{urls}");
+        assert_eq!(urls["operate"].is_string(), has_second, "{urls}");
+    }
+}
+
+/// Returns the commands that do something and are not hidden, by their names without `sgc`.
+fn leaves(command: &clap::Command, name: &str) -> Vec<(String, clap::Command)> {
+    let shown = command.get_subcommands().filter(|below| !below.is_hide_set());
+    let below: Vec<_> =
+        shown.flat_map(|below| leaves(below, format!("{name} {}", below.get_name()).trim())).collect();
+    if below.is_empty() { vec![(name.to_owned(), command.clone())] } else { below }
+}
+
+/// Commands without `--json`, and why.
+const WITHOUT_JSON: [(&str, &str); 5] = [
+    ("bench answer", "waits, and tells a person the command for the other machine"),
+    ("completions", "prints a program for a shell"),
+    ("router", "runs a node; --log-format has the form of its log"),
+    ("run", "runs a node; --log-format has the form of its log"),
+    ("topic pub", "prints the messages that the caller gave"),
+];
+
+#[test]
+fn every_command_that_prints_data_takes_json() {
+    let commands = leaves(&sgc::command_line(), "");
+    assert!(commands.len() > 40, "{}", commands.len());
+    let takes_json = |command: &clap::Command| {
+        let json = command.get_arguments().find(|arg| arg.get_long() == Some("json"));
+        json.is_some_and(|json| !json.is_hide_set() && !json.get_action().takes_values())
+    };
+    let mut without: Vec<_> =
+        commands.iter().filter(|(_, command)| !takes_json(command)).map(|(name, _)| name.as_str()).collect();
+    without.sort_unstable();
+    assert_eq!(without, WITHOUT_JSON.map(|(name, _)| name));
+}
+
+#[test]
 fn completions_and_man_pages_know_every_command() {
     let place = Place::new();
     for shell in ["bash", "zsh", "fish"] {

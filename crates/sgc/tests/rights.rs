@@ -749,12 +749,19 @@ fn a_token_hands_over_one_topic_and_is_taken_back() {
     for (to, permitted) in
         [(format!("acme-ca.pem:{cart}"), 0), (format!("acme-ca.pem:{}", "ab".repeat(32)), 1)]
     {
-        let args = [&give[..7], &["--to", &to, "--type", POSE]].concat();
+        let args = [&give[..7], &["--to", &to, "--type", POSE, "--json"]].concat();
         let ran = place.run(&args);
-        assert!(ran.stderr.contains("Token 2") || ran.stderr.contains("Token 3"), "{}", ran.stderr);
+        let id = if permitted == 0 { 2 } else { 3 };
+        assert!(ran.stderr.contains(&format!("Token {id} ")), "{}", ran.stderr);
+        let made: Value = serde_json::from_str(&ran.stdout).expect(&ran.stdout);
+        let token = ShareToken::parse(made["token"].as_str().unwrap()).unwrap();
+        assert_eq!((&made["id"], &made["expires"]), (&id.into(), &token.expires.to_string().into()));
+        assert_eq!(to.split_once(':').unwrap().1, made["node"], "{made}");
         assert_eq!(place.policy(&of_cart).0, Some(permitted), "{to}");
-        let id = if permitted == 0 { "2" } else { "3" };
-        place.good(&["token", "share", "revoke", "-c", "arm-1.toml", id]);
+        let ran = place.run(&["token", "share", "revoke", "-c", "arm-1.toml", "--json", &id.to_string()]);
+        let revoked: Value = serde_json::from_str(&ran.stdout).expect(&ran.stdout);
+        assert_eq!((&revoked["id"], &revoked["topic"]), (&id.into(), &"/handoff/pose".into()));
+        assert!(ran.stderr.contains("next start"), "{}", ran.stderr);
     }
     let said = place.bad(2, &[&give[..7], &["--to", "lab-ca.pem", "--type", POSE]].concat());
     assert!(said.contains("its nodes need no token"), "{said}");
@@ -804,6 +811,9 @@ fn a_program_without_ros_gets_a_token_that_is_taken_back() {
     let id = grant.id.to_string();
     let said = place.good(&["token", "access", "revoke", "-c", "arm-1.toml", &id[..12]]);
     assert!(said.contains("for dashboard is revoked") && said.contains("next start"), "{said}");
+    let ran = place.run(&["token", "access", "revoke", "-c", "arm-1.toml", "--json", &id]);
+    let again: Value = serde_json::from_str(&ran.stdout).expect(&ran.stdout);
+    assert_eq!(again, serde_json::json!({ "id": id, "for": "dashboard" }));
     let json = place.good(&[&list[..], &["--json"]].concat());
     let tokens: Vec<Value> = serde_json::from_str(&json).unwrap();
     let revoked: Vec<_> = tokens.iter().filter(|token| !token["revoked"].is_null()).collect();
@@ -813,7 +823,7 @@ fn a_program_without_ros_gets_a_token_that_is_taken_back() {
     let audit = place.good(&["audit", "-c", "arm-1.toml", "--json"]);
     let records: Vec<Value> = audit.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let events: Vec<_> = records.iter().map(|record| record["event"].as_str().unwrap()).collect();
-    assert_eq!(events, ["token_made", "token_made", "token_revoked"]);
+    assert_eq!(events, ["token_made", "token_made", "token_revoked", "token_revoked"]);
     let why = |at: usize| records[at]["reason"].as_str().unwrap().to_owned();
     assert!(why(0).contains(&format!("{} for dashboard, until ", &id[..12])), "{audit}");
     assert!(why(0).ends_with("subscribe /odom /camera/**; publish /cmd_vel"), "{audit}");
@@ -872,11 +882,21 @@ fn a_token_is_used_by_adding_three_lines() {
         said.contains("/handoff/pose [geometry_msgs/msg/PoseStamped] of arm-1") && said.contains("[[use]]"),
         "{said}"
     );
+    let json = |args: &[&str]| -> Value {
+        let ran = place.run(&[&["token", "use", "--json", "-c", "cart.toml"], args].concat());
+        assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+        serde_json::from_str(&ran.stdout).expect(&ran.stdout)
+    };
+    let planned = json(&["pose.token", "--dry-run"]);
+    assert_eq!((&planned["topic"], &planned["owner"]), (&"/handoff/pose".into(), &"arm-1".into()));
+    assert_eq!((&planned["dry_run"], &planned["config_file"]), (&true.into(), &"cart.toml".into()));
     assert_eq!(place.read("cart.toml"), before);
     assert!(!place.path("cart-state").exists());
 
     fs::set_permissions(place.path("cart.toml"), fs::Permissions::from_mode(0o640)).unwrap();
-    place.good(&["token", "use", "--token-file", "pose.token", "-c", "cart.toml"]);
+    let used = json(&["--token-file", "pose.token"]);
+    assert!(place.read("cart.toml").contains(used["added"].as_str().unwrap()), "{used}");
+    assert_eq!((&used["dry_run"], &used["token_file"]), (&false.into(), &planned["token_file"]));
     let after = place.read("cart.toml");
     assert!(after.starts_with(&before) && !after.contains("sgc-token"), "{after}");
     assert_eq!((place.mode("cart.toml"), place.mode("cart-state/tokens")), (0o640, 0o700));

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use rand_core::RngCore as _;
+use serde::Serialize;
 use sgc_gateway::{ACCESS_VALID_MS_MAX, AccessGrant, Scope, TokenId};
 use sgc_node::audit::{self, AuditEvent, AuditRecord};
 use sgc_node::config::{self, Config};
@@ -98,6 +99,18 @@ struct RevokeArgs {
     /// Configuration of the node; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// A revoked token as `--json` shows it.
+#[derive(Serialize)]
+struct RevokedJson<'a> {
+    id: &'a str,
+    /// `None` if the token is not listed here.
+    #[serde(rename = "for")]
+    label: Option<&'a str>,
 }
 
 /// Runs `sgc token access`.
@@ -210,9 +223,11 @@ fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     let record = AccessRecords::change(&state, |records| records.revoke(&args.id, unix_now()))?;
     let whose = if record.label.is_empty() { "which is not listed here" } else { &record.label };
     note(&config, &state, AuditEvent::TokenRevoked, &format!("{} for {whose}", short(&record.id)));
-    output::line(format!("token {} for {whose} is revoked", short(&record.id)))?;
+    let label = Some(record.label.as_str()).filter(|label| !label.is_empty());
+    let text = format!("token {} for {whose} is revoked", short(&record.id));
+    output::result(args.json, &RevokedJson { id: &record.id, label }, text)?;
     let socket = crate::node::socket_of(&config, identity.node_name().as_str());
-    reload::after_change(&socket)?.into_iter().try_for_each(output::line)
+    reload::after_change(&socket)?.iter().try_for_each(|line| output::remark(args.json, line))
 }
 
 /// Writes a record into the audit log of the node. A failure is only reported, because the change itself is already

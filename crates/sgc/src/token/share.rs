@@ -61,6 +61,9 @@ struct CreateArgs {
     /// Router at which the partner can reach this node; may be repeated [default: those of the configuration]
     #[arg(long, value_name = "URL")]
     router: Vec<String>,
+    /// Print the token, its number, its end and its receiver as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// List the tokens in force.
@@ -82,6 +85,9 @@ struct RevokeArgs {
     /// The owner's configuration; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// Runs `sgc token share`.
@@ -95,11 +101,9 @@ pub(super) fn share_token(args: &ShareArgs) -> Result<(), CliError> {
         ShareCommand::Revoke(args) => {
             let (config, identity, state) = open_owned(args.config.as_deref())?;
             let record = TokenRecords::change(&state, |records| records.withdraw(args.id))?;
-            output::line(format!(
-                "token {} for {} [{}] is revoked",
-                args.id, record.topic, record.type_name
-            ))?;
-            reload_node(&config, identity.node_name().as_str(), |line: String| output::line(line))
+            let text = format!("token {} for {} [{}] is revoked", args.id, record.topic, record.type_name);
+            output::result(args.json, &RecordJson::new(&record), text)?;
+            reload_node(&config, identity.node_name().as_str(), |line| output::remark(args.json, &line))
         }
     }
 }
@@ -149,7 +153,7 @@ fn give(
     if seen.is_some_and(|seen| !seen.is_empty() && !seen.contains(&type_name)) {
         output::diagnostic(&format!("Programs here have {topic} as another type than {type_name}."));
     }
-    let record = TokenRecord {
+    let mut record = TokenRecord {
         id: 0,
         topic: share.topic.clone(),
         type_name: share.type_name.unwrap_or_default(),
@@ -161,7 +165,8 @@ fn give(
         expires: token.expires.0,
     };
     // The record is on disk before the token is printed: the owner refuses a token that it does not know.
-    let id = TokenRecords::change(state, |records| records.add(record, now))?;
+    let id = TokenRecords::change(state, |records| records.add(record.clone(), now))?;
+    record.id = id;
     output::diagnostic(&format!(
         "Token {id} for {topic} [{type_name}], until {}. Whoever has it and a certificate of that CA may subscribe: keep it secret.\n\
          There: sgc token use -, which reads it from standard input. To take it back: sgc token share revoke {id}",
@@ -172,7 +177,9 @@ fn give(
         output::diagnostic(&line);
         Ok(())
     });
-    output::line(token.to_text().as_str())?;
+    let text = token.to_text();
+    let json = TokenJson { record: RecordJson::new(&record), token: text.as_str() };
+    output::result(args.json, &json, text.as_str())?;
     told
 }
 
@@ -187,6 +194,14 @@ struct RecordJson<'a> {
     node: Option<&'a str>,
     created: String,
     expires: String,
+}
+
+/// A new token as `--json` shows it.
+#[derive(Serialize)]
+struct TokenJson<'a> {
+    #[serde(flatten)]
+    record: RecordJson<'a>,
+    token: &'a str,
 }
 
 impl<'a> RecordJson<'a> {

@@ -7,6 +7,7 @@ use std::io::{IsTerminal, Read, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use serde::Serialize;
 use sgc_node::config::{self, Config, Interface, TokenSource};
 use sgc_process::{ProcessError, unix_now};
 use sgc_trust::{ShareToken, TOKEN_PREFIX, TOKEN_TEXT_BYTES_MAX};
@@ -37,6 +38,27 @@ pub(super) struct UseArgs {
     /// Print the changes without making them
     #[arg(long)]
     dry_run: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The used topic and the changes for it, as `--json` shows them.
+#[derive(Serialize)]
+struct UsedJson<'a> {
+    topic: &'a str,
+    #[serde(rename = "type")]
+    type_name: &'a str,
+    owner: &'a str,
+    expires: String,
+    /// Fingerprint of the owner's CA.
+    ca: &'a str,
+    token_file: String,
+    config_file: String,
+    /// Text that is added to the configuration.
+    added: &'a str,
+    /// Nothing was changed.
+    dry_run: bool,
 }
 
 /// Runs `sgc token use`.
@@ -65,10 +87,26 @@ pub(super) fn use_token(args: &UseArgs) -> Result<(), CliError> {
         return Err(CliError::Cannot { reason });
     }
     let ca = token.ca_fingerprint()?;
-    output::line(format!(
-        "{} [{}] of {}, until {}; its CA is {ca}",
-        token.metadata.ros_name, token.metadata.type_name, token.owner_name, token.expires
-    ))?;
+    let json = UsedJson {
+        topic: &token.metadata.ros_name,
+        type_name: &token.metadata.type_name,
+        owner: token.owner_name.as_str(),
+        expires: token.expires.to_string(),
+        ca: &ca.to_string(),
+        token_file: file.display().to_string(),
+        config_file: path.display().to_string(),
+        added: block.trim(),
+        dry_run: args.dry_run,
+    };
+    if args.dry_run && args.json {
+        return output::json(&json);
+    }
+    if !args.json {
+        output::line(format!(
+            "{} [{}] of {}, until {}; its CA is {ca}",
+            token.metadata.ros_name, token.metadata.type_name, token.owner_name, token.expires
+        ))?;
+    }
     if args.dry_run {
         output::line(format!("would write {} and add to {}:", file.display(), path.display()))?;
         return output::line(block.trim());
@@ -84,9 +122,10 @@ pub(super) fn use_token(args: &UseArgs) -> Result<(), CliError> {
     sgc_node::create_state_dir(&state.join(TOKENS_DIR))?;
     files::write_secret(&file, &token.to_text(), files::Existing::Replace)?;
     replace(&path, &after)?;
-    output::line(format!("added to {}; the token is in {}", path.display(), file.display()))?;
+    let text = format!("added to {}; the token is in {}", path.display(), file.display());
+    output::result(args.json, &json, text)?;
     let socket = crate::node::socket_of(&config, node);
-    reload::after_change(&socket)?.into_iter().try_for_each(output::line)
+    reload::after_change(&socket)?.iter().try_for_each(|line| output::remark(args.json, line))
 }
 
 fn token_text(given: &str) -> Result<Zeroizing<String>, CliError> {
