@@ -15,10 +15,11 @@ use crate::error::CliError;
 #[derive(Debug, Args)]
 pub(crate) struct NodeArgs {
     /// Configuration of the node; without it, the only node of this user or of a service here
-    #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
+    #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "running_node"])]
     config: Option<PathBuf>,
     /// Name of the node, if its socket is in the usual place
-    #[arg(long, value_name = "NAME", conflicts_with = "socket")]
+    // Commands that ask this node about another one have a positional of the id `node`.
+    #[arg(id = "running_node", long = "node", value_name = "NAME", conflicts_with = "socket")]
     node: Option<String>,
     /// Status socket of the node
     #[arg(long, value_name = "PATH")]
@@ -26,35 +27,31 @@ pub(crate) struct NodeArgs {
 }
 
 impl NodeArgs {
+    /// Returns `true` if the arguments name a node.
+    pub(crate) fn is_given(&self) -> bool {
+        self.config.is_some() || self.node.is_some() || self.socket.is_some()
+    }
+
     /// Returns the node's status socket.
     pub(crate) fn socket(&self) -> Result<PathBuf, CliError> {
-        socket(self.config.as_deref(), self.node.as_deref(), self.socket.as_deref())
+        if let Some(socket) = &self.socket {
+            return Ok(socket.clone());
+        }
+        if let Some(node) = &self.node {
+            return found(node);
+        }
+        let Some(path) = &self.config else { return only_socket() };
+        let config = config::load(path, &environment)
+            .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
+        match config.admin_socket {
+            Some(socket) => Ok(socket),
+            None => found(&ask::node_name(&config)?),
+        }
     }
 
     /// Returns the node's graph.
     pub(crate) fn graph(&self, name: Option<sgc_wire::Name>) -> Result<Graph, CliError> {
         Ok(ask::graph(&self.socket()?, name)?)
-    }
-}
-
-/// Returns the named socket, the socket of the configuration, or the only socket of this user and of services.
-pub(crate) fn socket(
-    config: Option<&Path>,
-    node: Option<&str>,
-    socket: Option<&Path>,
-) -> Result<PathBuf, CliError> {
-    if let Some(socket) = socket {
-        return Ok(socket.to_owned());
-    }
-    if let Some(node) = node {
-        return found(node);
-    }
-    let Some(path) = config else { return only_socket() };
-    let config = config::load(path, &environment)
-        .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
-    match config.admin_socket {
-        Some(socket) => Ok(socket),
-        None => found(&ask::node_name(&config)?),
     }
 }
 

@@ -818,6 +818,35 @@ fn fleet_commands_print_their_results_as_json() {
 }
 
 #[test]
+fn fleet_commands_name_the_node_that_asks_an_authority_as_other_commands_do() {
+    let place = Place::with_fleet();
+    place.write("node.toml", "[node]\nname = 'arm-1'\nrouters = ['quic://a']\n[admin]\nsocket = 'a.sock'\n");
+    let usual = place.path().join("sgc/arm-1.sock").display().to_string();
+    let node = [
+        (&["-c", "node.toml"][..], "a.sock"),
+        (&["--socket", "b.sock"], "b.sock"),
+        (&["--node", "arm-1"], &usual),
+    ];
+    for command in [&["list"][..], &["enroll", "x"], &["renew", "desk"], &["revoke", "desk"]] {
+        for (named, socket) in node {
+            let args = [&["fleet"][..], command, named].concat();
+            place.says(
+                2,
+                &args,
+                "-c, --node and --socket name the node that sends a request: add --at AUTHORITY",
+            );
+            let args = [&args[..], &["--at", "keeper"]].concat();
+            place.says(1, &args, &format!("no node runs at {socket}: there is no such socket"));
+        }
+    }
+    // The node here also names the routers of an invitation, with and without an authority.
+    for (named, socket) in node {
+        let said = place.bad(2, &[&["fleet", "invite", "x"], named].concat());
+        assert!(said.contains(&format!("no node runs at {socket}: ")), "{said}");
+    }
+}
+
+#[test]
 fn validity_in_days_is_refused_with_its_span() {
     let place = Place::with_fleet();
     for verb in ["enroll", "renew"] {

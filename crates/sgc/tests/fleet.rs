@@ -707,7 +707,7 @@ fn an_operator_keeps_the_fleet_from_a_machine_without_its_file() {
     let _cloud = place.start("cloud", port, &format!("[router]\nlisten = [\"quic://127.0.0.1:{port}\"]\n"));
     let keeper = place.keeper(port);
     let (_desk, _arm) = (place.start("desk", port, ""), place.start("arm-1", port, ""));
-    let at = ["--at", "keeper", "--socket", "desk.sock"];
+    let at = ["--at", "keeper", "-c", "desk.toml"];
     let good = |args: &[&str]| place.good(&[&["fleet"], args, &at].concat());
     let refused = |args: &[&str]| {
         let ran = place.run(&[&["fleet"], args].concat());

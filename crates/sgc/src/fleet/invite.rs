@@ -1,12 +1,10 @@
 //! `sgc fleet invite`: makes a code with which a machine becomes a node by itself.
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
 use serde::Serialize;
-use sgc_diagnosis::ask;
 use sgc_node::config::RouterUrl;
 use sgc_process::system_rng;
 use sgc_trust::{INVITATION_ROUTERS_MAX, Invitation, LEAF_VALIDITY_DEFAULT};
@@ -14,8 +12,9 @@ use sgc_wire::Operation;
 
 use super::role::AdmitArgs;
 use crate::error::CliError;
+use crate::node::NodeArgs;
+use crate::output;
 use crate::span::{millis, parse_span};
-use crate::{node, output};
 
 const WITHIN_DEFAULT: Duration = Duration::from_secs(15 * 60);
 
@@ -62,7 +61,7 @@ pub(super) fn invite(args: &InviteArgs) -> Result<(), CliError> {
     let within = args.within.unwrap_or(WITHIN_DEFAULT);
     let routers = routers(args)?;
     let place = &args.admit.place;
-    let invitation = match place.remote()? {
+    let invitation = match place.authority()? {
         Some(remote) => remote.invite(Operation::Invite {
             node: request.node.to_string(),
             groups: request.groups.iter().map(ToString::to_string).collect(),
@@ -101,7 +100,7 @@ fn routers(args: &InviteArgs) -> Result<Vec<String>, CliError> {
     let given = !args.via.is_empty();
     let found = match given {
         true => args.via.clone(),
-        false => routers_here(args.admit.place.socket())?,
+        false => routers_here(&args.admit.place.node)?,
     };
     if found.is_empty() {
         return Err(cannot(
@@ -122,17 +121,18 @@ fn routers(args: &InviteArgs) -> Result<Vec<String>, CliError> {
 }
 
 /// Returns the routers of the node that runs here, as its user wrote them.
-fn routers_here(socket: Option<PathBuf>) -> Result<Vec<String>, CliError> {
+fn routers_here(node: &NodeArgs) -> Result<Vec<String>, CliError> {
     let asked = || -> Result<Vec<String>, CliError> {
-        let socket = node::socket(None, None, socket.as_deref())?;
-        let graph = ask::graph(&socket, None)?;
+        let graph = node.graph(None)?;
         let mut seen = BTreeSet::new();
         let routers = graph.routers.into_iter().map(|router| router.router);
         Ok(routers.filter(|url| seen.insert(url.clone())).collect())
     };
     asked().map_err(|why| {
         let why = match why {
-            CliError::SeveralNodes { .. } => "several nodes run here".to_owned(),
+            CliError::SeveralNodes { nodes } => {
+                format!("several nodes run here, choose one with --node: {}", nodes.join(", "))
+            }
             why => why.to_string(),
         };
         CliError::Cannot {

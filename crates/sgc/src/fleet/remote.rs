@@ -19,7 +19,7 @@ use zeroize::Zeroizing;
 
 use super::WhichFleet;
 use crate::error::CliError;
-use crate::node;
+use crate::node::NodeArgs;
 
 /// Longest wait for the node's answer. The node gives up earlier.
 const ANSWER_MAX: Duration = Duration::from_secs(40);
@@ -30,25 +30,31 @@ pub(super) struct FleetPlace {
     #[command(flatten)]
     pub(super) which: WhichFleet,
     /// Let the fleet's authority do it, over the mesh: the name of its node. Your node that runs here sends the
-    /// request; the authority's configuration has to list it in `operators`
+    /// request, and -c, --node or --socket choose it if there are several; the authority's configuration has to list
+    /// it in `operators`
     #[arg(long, value_name = "AUTHORITY", conflicts_with = "fleet")]
     at: Option<String>,
-    /// With --at: status socket of the node that sends the request, if it is not the only one here
-    #[arg(long, value_name = "PATH", requires = "at")]
-    socket: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) node: NodeArgs,
 }
 
 impl FleetPlace {
-    /// Returns the status socket that `--socket` names.
-    pub(super) fn socket(&self) -> Option<PathBuf> {
-        self.socket.clone()
+    /// Returns the authority, if `--at` names one. Without it, a command works on a fleet file and asks no node, so
+    /// arguments that name a node are refused.
+    pub(super) fn remote(&self) -> Result<Option<Remote>, CliError> {
+        if self.at.is_none() && self.node.is_given() {
+            return Err(CliError::Cannot {
+                reason: "-c, --node and --socket name the node that sends a request: add --at AUTHORITY"
+                    .to_owned(),
+            });
+        }
+        self.authority()
     }
 
-    /// Returns the authority, if `--at` names one.
-    pub(super) fn remote(&self) -> Result<Option<Remote>, CliError> {
+    /// Returns the authority, if `--at` names one. The command may also ask the node for something else.
+    pub(super) fn authority(&self) -> Result<Option<Remote>, CliError> {
         let Some(at) = &self.at else { return Ok(None) };
-        let at = at.parse()?;
-        Ok(Some(Remote { at, socket: node::socket(None, None, self.socket.as_deref())? }))
+        Ok(Some(Remote { at: at.parse()?, socket: self.node.socket()? }))
     }
 }
 
