@@ -79,7 +79,7 @@ pub fn answer(args: &AnswerOptions) -> Result<(), MeasureError> {
 }
 
 fn introduce(name: &str, is_direct: bool, urls: &[String]) -> Result<(), MeasureError> {
-    let how = if is_direct { "--to" } else { "--router" };
+    let how = if is_direct { "--connect" } else { "--router" };
     output::line(format!("{name} waits at {}", urls.join(",")))?;
     output::line("On the other machine, with the identity of another node of the fleet:")?;
     // A node that listens on all addresses does not know the one at which it is reached.
@@ -312,9 +312,11 @@ impl AnswerSide {
     /// Returns the address of the only linked machine.
     fn peer(&self) -> Result<IpAddr, String> {
         if !self.is_direct {
-            return Err("through a router it is not known where the two machines are: measure with --listen and --to \
-                        if one reaches the other"
-                .to_owned());
+            return Err(
+                "through a router it is not known where the two machines are: measure with --listen and \
+                        --connect if one reaches the other"
+                    .to_owned(),
+            );
         }
         let status = self.side.status().map_err(|error| error.to_string())?;
         let mut peers: Vec<_> = status

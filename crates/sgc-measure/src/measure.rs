@@ -71,7 +71,7 @@ pub struct MeasureOptions {
     /// Name of the answering node.
     pub with: NodeName,
     /// URLs at which it listens; none if `router` names one.
-    pub to: Vec<String>,
+    pub connect: Vec<String>,
     /// Routers between the two sides.
     pub router: Vec<String>,
     /// Suites to measure.
@@ -151,7 +151,7 @@ impl<'a> MeasureSide<'a> {
         sender: SyncSender<Event>,
         run: RunId,
     ) -> Result<Self, MeasureError> {
-        let urls = if args.router.is_empty() { &args.to } else { &args.router };
+        let urls = if args.router.is_empty() { &args.connect } else { &args.router };
         let topics = Topics::Of(args.with.to_string(), args.suites.clone());
         let side = Side::start(&args.identity, &Rendezvous::Connect(urls.clone()), &topics, &sender)?;
         wait_ready(&events, &side)?;
@@ -367,7 +367,7 @@ impl<'a> MeasureSide<'a> {
 
     fn path(&self) -> Path {
         let (via, urls) = match self.args.router.is_empty() {
-            true => ("direct", &self.args.to),
+            true => ("direct", &self.args.connect),
             false => ("router", &self.args.router),
         };
         // Only the scheme, because a report must not reveal hosts.

@@ -66,9 +66,9 @@ pub(crate) struct MeasureArgs {
     with: NodeName,
     /// URL at which it listens, such as quic://desk.example:7448; several separated by commas
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, required_unless_present = "router")]
-    to: Vec<String>,
+    connect: Vec<String>,
     /// Router of yours instead; the other side has to name it too; several separated by commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "to")]
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "connect")]
     router: Vec<String>,
     /// Suites to measure, separated by commas
     #[arg(long, value_name = "SUITES", value_delimiter = ',', default_value = "group,pairwise")]
@@ -119,7 +119,7 @@ pub(crate) fn bench(args: BenchArgs) -> Result<ExitCode, CliError> {
             let options = MeasureOptions {
                 identity: args.identity,
                 with: args.with,
-                to: args.to,
+                connect: args.connect,
                 router: args.router,
                 suites: args.suites,
                 sizes: args.sizes,

@@ -113,7 +113,13 @@ pub fn main(build: Build) -> ExitCode {
             memory::close(cli.allow_core_dumps);
             run(cli.command)
         }
-        Err(error) => return error::usage(&error, &called(std::env::args())),
+        Err(error) => {
+            let called = called(std::env::args());
+            return match moved::moved_option(&error, &called) {
+                Some(error) => error.report(),
+                None => error::usage(&error, &called),
+            };
+        }
     };
     match result {
         Ok(code) => code,

@@ -32,7 +32,7 @@ pub(crate) struct NameArgs {
     identity: PathBuf,
     /// `node` of the share: the ROS node that provides it
     #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
-    node: String,
+    ros_node: String,
     /// `author` of the share
     #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
     author: String,
@@ -75,7 +75,7 @@ impl NameArgs {
         let fields = [
             ("topic", &self.topic),
             ("type", &self.type_name),
-            ("node", &self.node),
+            ("node", &self.ros_node),
             ("author", &self.author),
             ("maintainer", &self.maintainer),
             ("interface", &self.interface),
@@ -117,7 +117,7 @@ mod tests {
             topic: "/t".into(),
             type_name: "p::msg::dds_::T_".into(),
             identity: "x".into(),
-            node: String::new(),
+            ros_node: String::new(),
             author: String::new(),
             maintainer: String::new(),
             interface: String::new(),

@@ -171,7 +171,7 @@ fn a_run_measures_every_way_and_loses_nothing() {
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0,tcp://127.0.0.1:0"]);
     let urls = answer.said("desk waits at ");
     let (quic, tcp) = urls.split_once(',').unwrap();
-    let args = ["--with", "desk", "--to", quic, "--sizes", "16,1000,100kB", "--duration", "1s"];
+    let args = ["--with", "desk", "--connect", quic, "--sizes", "16,1000,100kB", "--duration", "1s"];
     let files = ["--json-file", "run.json", "--markdown", "run.md"];
     let output = lab.run("robot.identity", &[&args[..], &files].concat());
     assert!(output.status.success(), "{}", stderr(&output));
@@ -199,7 +199,7 @@ fn a_run_measures_every_way_and_loses_nothing() {
 
     // The side is ready for another run, by another transport and with another suite.
     let args =
-        ["--with", "desk", "--to", tcp, "--sizes", "16", "--duration", "1s", "--suites", "group-chacha"];
+        ["--with", "desk", "--connect", tcp, "--sizes", "16", "--duration", "1s", "--suites", "group-chacha"];
     let output = lab.run("robot.identity", &[&args[..], &["--json-file", "run.json"]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
     let report: Value = serde_json::from_slice(&fs::read(lab.dir.path().join("run.json")).unwrap()).unwrap();
@@ -235,7 +235,7 @@ fn another_fleet_is_refused_and_told_so() {
     let lab = Lab::new();
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
     let url = answer.said("desk waits at ");
-    let output = lab.run("stranger.identity", &["--with", "desk", "--to", &url, "--duration", "1s"]);
+    let output = lab.run("stranger.identity", &["--with", "desk", "--connect", &url, "--duration", "1s"]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let said = stderr(&output);
     assert!(said.starts_with("sgc: bench: no link to desk\n"), "{said}");
@@ -248,16 +248,16 @@ fn a_wrong_name_or_address_of_the_other_side_is_said_to_be_one() {
     let lab = Lab::new();
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
     let url = answer.said("desk waits at ");
-    let output = lab.run("robot.identity", &["--with", "dask", "--to", &url, "--duration", "1s"]);
+    let output = lab.run("robot.identity", &["--with", "dask", "--connect", &url, "--duration", "1s"]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let said = stderr(&output);
     let address = url.strip_prefix("quic://").unwrap();
     assert!(said.starts_with(&format!("sgc: bench: the node at {address} is not dask\n")), "{said}");
     assert!(said.contains("prints the name of its node"), "{said}");
-    let output = lab.run("robot.identity", &["--with", "desk", "--to", address, "--duration", "1s"]);
+    let output = lab.run("robot.identity", &["--with", "desk", "--connect", address, "--duration", "1s"]);
     assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
     let said = stderr(&output);
-    assert!(said.contains("for '--to <URL>'") && !said.contains("`routers`"), "{said}");
+    assert!(said.contains("for '--connect <URL>'") && !said.contains("`routers`"), "{said}");
     assert!(said.trim().ends_with("see `sgc bench run --help`"), "{said}");
 }
 
@@ -266,7 +266,7 @@ fn the_end_of_the_other_side_is_told_and_ends_a_run() {
     let lab = Lab::new();
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
     let url = answer.said("desk waits at ");
-    let args = ["bench", "run", "--identity", "robot.identity", "--with", "desk", "--to", &url];
+    let args = ["bench", "run", "--identity", "robot.identity", "--with", "desk", "--connect", &url];
     let mut run = lab.sgc(&[&args[..], &["--duration", "60s", "--sizes", "1000"]].concat());
     let run = run.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     answer.said("a run goes on");
@@ -283,11 +283,11 @@ fn wrong_arguments_are_reported_before_anything_runs() {
     let lab = Lab::new();
     let url = "quic://127.0.0.1:9";
     for (args, part) in [
-        (&["--with", "robot", "--to", url][..], "cannot measure with itself"),
-        (&["--with", "desk"], "--to"),
-        (&["--with", "desk", "--to", "nonsense"], "nonsense"),
-        (&["--with", "desk", "--to", url, "--sizes", "1GB"], "1 to 32000000 bytes"),
-        (&["--with", "desk", "--to", url, "--suites", "rot13"], "rot13"),
+        (&["--with", "robot", "--connect", url][..], "cannot measure with itself"),
+        (&["--with", "desk"], "--connect"),
+        (&["--with", "desk", "--connect", "nonsense"], "nonsense"),
+        (&["--with", "desk", "--connect", url, "--sizes", "1GB"], "1 to 32000000 bytes"),
+        (&["--with", "desk", "--connect", url, "--suites", "rot13"], "rot13"),
     ] {
         let output = lab.run("robot.identity", args);
         assert_eq!(output.status.code(), Some(2), "{args:?}: {}", stderr(&output));

@@ -493,7 +493,7 @@ fn a_name_is_the_one_that_the_nodes_derive() {
     let said = place.good(&args(&[
         "--owner",
         "arm-1",
-        "--node",
+        "--ros-node",
         "/camera",
         "--author",
         "Ada",
@@ -536,7 +536,7 @@ fn invalid_share_has_no_name() {
 #[test]
 fn usage_errors_are_one_line_and_code_2() {
     let place = Place::new();
-    let bench = ["bench", "run", "--identity", "x", "--with", "desk", "--to", "quic://desk"];
+    let bench = ["bench", "run", "--identity", "x", "--with", "desk", "--connect", "quic://desk"];
     place.says(2, &["fly"], "unrecognized subcommand 'fly'; see `sgc --help`");
     // Earlier spellings are refused with the present ones, whatever stands behind them.
     for (old, new) in [
@@ -551,6 +551,13 @@ fn usage_errors_are_one_line_and_code_2() {
         (&["demo", "--seconds", "10"], "--duration 10s"),
         (&[&bench[..], &["--seconds", "5"]].concat(), "--duration 5s"),
         (&[&bench[..], &["--json", "run.json"]].concat(), "--json-file run.json"),
+        (&["bench", "run", "--with", "desk", "--to", "quic://desk"], "--connect"),
+        (&["fleet", "accept", "a.pem", "--ca", "ca.pem", "--node", "a"], "--node-name"),
+        (&["join", "--wait=1s"], "--timeout"),
+        (&["name", "--owner", "a", "--node", "driver"], "--ros-node"),
+        (&["topic", "pub", "/t", "--wait", "1"], "--wait-subscribers"),
+        (&["topic", "pub", "/t", "-w", "1"], "--wait-subscribers"),
+        (&["topic", "pub", "/t", "-w1"], "--wait-subscribers"),
     ] {
         let said = place.bad(2, old);
         assert!(said.contains("has another name now") && said.trim_end().ends_with(new), "{old:?}: {said}");

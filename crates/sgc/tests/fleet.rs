@@ -503,7 +503,7 @@ fn a_certificate_of_a_ca_that_keeps_its_key() {
     // A fleet file supplies the secret; its CA is not used.
     place.good(&["fleet", "create", "lab"]);
     let said = place.good(&["fleet", "request", "arm-1", "--secret", "lab.fleet"]);
-    assert!(said.contains("sgc fleet accept CERTIFICATE --ca CA --node arm-1"), "{said}");
+    assert!(said.contains("sgc fleet accept CERTIFICATE --ca CA --node-name arm-1"), "{said}");
     let sign = |uri: &str, file: &str| {
         // A CA takes the key and the alternative names from a request.
         let mut leaf = CertificateParams::default();
@@ -517,7 +517,8 @@ fn a_certificate_of_a_ca_that_keeps_its_key() {
     let der = sgc_trust::pem_contents(&csr, &["CERTIFICATE REQUEST"]).unwrap();
     assert!(der[0].windows(uri.len()).any(|w| w == uri.as_bytes()), "the request names the node");
     sign(&uri, "arm-1.pem");
-    let accept = ["fleet", "accept", "arm-1.pem", "--ca", "ca.pem", "--node", "arm-1", "--fleet-name", "lab"];
+    let accept =
+        ["fleet", "accept", "arm-1.pem", "--ca", "ca.pem", "--node-name", "arm-1", "--fleet-name", "lab"];
     place.good(&[&accept[..], &["--secret", "lab.fleet"]].concat());
     let identity = place.identity("arm-1.identity");
     assert_eq!(identity.fleet_secret().unwrap().expose(), place.fleet().secret().expose());
@@ -585,7 +586,7 @@ fn extensions_that_were_reviewed_make_a_node_and_nothing_more() {
         "arm-1.pem",
         "--ca",
         "ca.pem",
-        "--node",
+        "--node-name",
         "arm-1",
         "--fleet-name",
         "acme",
@@ -880,7 +881,7 @@ fn a_machine_joins_with_a_code_and_the_code_is_good_once() {
 
     // Faults on the way name what to do, and cost no code.
     let late = invite(&["arm-9", "--via", &format!("quic://127.0.0.1:{}", unused_port())]);
-    let said = refused(&["join", "--wait", "1s", &late], 1);
+    let said = refused(&["join", "--timeout", "1s", &late], 1);
     assert!(said.contains("no router within 1 s") && said.contains("--router names another"), "{said}");
     drop(keeper);
     let said = refused(&["join", "--router", &url, &late], 1);

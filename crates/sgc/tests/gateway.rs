@@ -82,7 +82,8 @@ fn number_of_messages_counts_for_standard_input_too() {
     let lab = lab("");
     fs::write(lab.dir().join("lines"), "data: a\ndata: b\nno message\n").unwrap();
     let publish = |number: &[&str]| {
-        let args = ["topic", "pub", "/lines", "std_msgs/String", "--wait", "0", "--socket", "desk.sock"];
+        let args =
+            ["topic", "pub", "/lines", "std_msgs/String", "--wait-subscribers", "0", "--socket", "desk.sock"];
         let mut command = lab.sgc(Some(Site::Desk), &[&args, number].concat());
         command.stdin(fs::File::open(lab.dir().join("lines")).unwrap()).output().unwrap()
     };

@@ -66,9 +66,9 @@ pub(crate) struct JoinArgs {
     /// Router to use in place of those that the code names; may be repeated
     #[arg(long, value_name = "URL")]
     router: Vec<String>,
-    /// How long to look for a router, such as 10min [default: 60s]
+    /// Longest time to look for a router, such as 10min [default: 60s]
     #[arg(long, value_name = "TIME", value_parser = parse_span)]
-    wait: Option<Duration>,
+    timeout: Option<Duration>,
     /// Replace an existing identity
     #[arg(long)]
     force: bool,
@@ -153,7 +153,7 @@ pub(crate) fn join(args: JoinArgs) -> Result<(), CliError> {
     let routers = if args.router.is_empty() { &invitation.routers } else { &args.router };
     let from = if args.router.is_empty() { "the code" } else { "--router" };
     let key = KeyRequest::generate(None, &mut system_rng()?).map_err(CliError::Making)?;
-    let wait = args.wait.unwrap_or(WAIT_DEFAULT);
+    let wait = args.timeout.unwrap_or(WAIT_DEFAULT);
     let member = ask_authority(&invitation, (routers, from), &key, wait, (runtime, signals))?;
     let is_router = member.is_router();
     let identity = Identity::join(member, key.key(), &mut system_rng()?)

@@ -48,11 +48,11 @@ pub(super) struct AcceptArgs {
     #[arg(long, value_name = "FILE")]
     key: Option<PathBuf>,
     /// Certificates of the CAs to trust, PEM; the answer is then a certificate that an existing CA made for the request
-    #[arg(long, value_name = "FILE", requires = "node", requires = "fleet_name")]
+    #[arg(long, value_name = "FILE", requires = "node_name", requires = "fleet_name")]
     ca: Option<PathBuf>,
     /// With --ca: name of the node
-    #[arg(long, value_name = "NODE", requires = "ca")]
-    node: Option<String>,
+    #[arg(long, value_name = "NAME", requires = "ca")]
+    node_name: Option<String>,
     /// With --ca: name of the fleet, for people
     #[arg(long, value_name = "NAME", requires = "ca")]
     fleet_name: Option<String>,
@@ -138,7 +138,7 @@ pub(super) fn extensions(args: &ExtensionsArgs) -> Result<(), CliError> {
     let uris = certificate_uris(&secret, &node, &groups, routes);
     files::write_public(&path, extensions_text(&node, &groups, routes, &uris).as_bytes())?;
     let file = path.display();
-    let mut accept = format!("sgc fleet accept {node}.pem --ca CA.pem --node {node} --fleet-name NAME");
+    let mut accept = format!("sgc fleet accept {node}.pem --ca CA.pem --node-name {node} --fleet-name NAME");
     if !is_router {
         accept.push_str(" --secret FILE");
         groups.iter().for_each(|group| accept.push_str(&format!(" --group {group}")));
@@ -198,7 +198,7 @@ pub(super) fn request(args: &RequestArgs) -> Result<(), CliError> {
             "{key}: the private key of {node}; it stays here\n\
              {csr}: the request, no secret. Have the CA sign it with the extensions that `sgc fleet extensions \
              {node}` writes. Then, here:\n  \
-             sgc fleet accept CERTIFICATE --ca CA --node {node} --fleet-name NAME --secret FILE"
+             sgc fleet accept CERTIFICATE --ca CA --node-name {node} --fleet-name NAME --secret FILE"
         ),
     };
     output::result(args.json, &json, text)
@@ -207,7 +207,7 @@ pub(super) fn request(args: &RequestArgs) -> Result<(), CliError> {
 pub(super) fn accept(args: &AcceptArgs) -> Result<(), CliError> {
     let rng = &mut system_rng()?;
     let broken = |source| CliError::Identity { path: args.answer.clone(), source };
-    let identity = match (&args.ca, &args.node, &args.fleet_name) {
+    let identity = match (&args.ca, &args.node_name, &args.fleet_name) {
         (Some(ca), Some(node), Some(fleet)) => {
             let (node, fleet): (NodeName, FleetName) = (node.parse()?, fleet.parse()?);
             let import = Import {

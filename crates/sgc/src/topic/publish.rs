@@ -64,8 +64,8 @@ pub(crate) struct PubArgs {
     count: Option<u64>,
     /// Wait first for N subscribers on the local network, including the node's own for the far side [default: 1 with
     /// --once, else 0]
-    #[arg(short, long, value_name = "N")]
-    wait: Option<u32>,
+    #[arg(long, value_name = "N")]
+    wait_subscribers: Option<u32>,
     /// Longest time to wait for subscribers
     #[arg(long, value_name = "TIME", default_value = "10s", value_parser = parse_span)]
     timeout: Duration,
@@ -147,7 +147,7 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
     let not_a_message = |reason: String| CliError::Cannot { reason: format!("the message: {reason}") };
     let message = message.map(yaml::json_of).transpose().map_err(not_a_message)?;
     let period = args.period.or(message.is_some().then_some(PERIOD_DEFAULT));
-    let wait_for = args.wait.unwrap_or(u32::from(args.once));
+    let wait_for = args.wait_subscribers.unwrap_or(u32::from(args.once));
     let wish = PublishRequest {
         topic: args.topic.clone(),
         type_name: type_name.map(str::to_owned),
