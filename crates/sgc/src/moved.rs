@@ -13,11 +13,14 @@ pub(crate) struct MovedArgs {
 }
 
 /// Options that have another name now: the command, the earlier spelling, and the present one.
-const MOVED_OPTIONS: [(&str, &str, &str); 6] = [
+const MOVED_OPTIONS: [(&str, &str, &str); 9] = [
     ("sgc bench run", "--to", "--connect"),
     ("sgc fleet accept", "--node", "--node-name"),
+    ("sgc fleet merge", "--router", "--push"),
+    ("sgc fleet revoke", "--router", "--push"),
     ("sgc join", "--wait", "--timeout"),
     ("sgc name", "--node", "--ros-node"),
+    ("sgc token share create", "--router", "--via"),
     ("sgc topic pub", "--wait", "--wait-subscribers"),
     ("sgc topic pub", "-w", "--wait-subscribers"),
 ];

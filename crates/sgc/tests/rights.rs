@@ -926,7 +926,7 @@ fn a_token_is_used_by_adding_three_lines() {
     assert!(said.starts_with("/handoff/pose of arm-1 is no longer used (by token)"), "{said}");
     node.end();
     // A node that started without a rule also takes one, and dials the router that the token names.
-    let another = ["--router", "quic://127.0.0.1:10"];
+    let another = ["--via", "quic://127.0.0.1:10"];
     place.write("pose.token", place.good(&[&args[..], &another].concat()).trim());
     let node = place.start("cart.toml");
     let said = place.good(&["token", "use", "pose.token", "-c", "cart.toml"]);

@@ -27,8 +27,8 @@ pub(super) struct MergeArgs {
     other: PathBuf,
     /// Push the revocation list to this router as well; may be repeated. Nodes of this user on this machine always get
     /// it
-    #[arg(long = "router", value_name = "URL")]
-    routers: Vec<LinkUrl>,
+    #[arg(long, value_name = "URL")]
+    push: Vec<LinkUrl>,
     #[command(flatten)]
     which: WhichFleet,
     /// Print the result as JSON
@@ -95,7 +95,7 @@ pub(super) fn merge(args: &MergeArgs) -> Result<(), CliError> {
     file.save()?;
     let (list_path, list) = write_list(&file, now)?;
     text.push_str(&format!("{}: revocation list {}\n", list_path.display(), file.fleet.crl_number()));
-    let pushed = push_crl(&mut file, &list, &args.routers)?;
+    let pushed = push_crl(&mut file, &list, &args.push)?;
     if !pushed.names.is_empty() {
         text.push_str(&format!("Pushed to {}: nodes pass it on to each other.\n", pushed.names.join(", ")));
     }

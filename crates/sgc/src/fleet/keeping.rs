@@ -54,8 +54,8 @@ pub(super) struct RevokeArgs {
     /// Names of the nodes
     nodes: Vec<String>,
     /// Push the list to this router as well; may be repeated. Nodes of this user on this machine always get it
-    #[arg(long = "router", value_name = "URL")]
-    routers: Vec<LinkUrl>,
+    #[arg(long, value_name = "URL")]
+    push: Vec<LinkUrl>,
     #[command(flatten)]
     place: FleetPlace,
     /// Print the result as JSON
@@ -229,10 +229,10 @@ pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
         text.push_str(&format!("{node}: revoked\n"));
     }
     text.push_str(&format!("{}: revocation list {}\n", path.display(), file.fleet.crl_number()));
-    let pushed = push_crl(&mut file, &list, &args.routers)?;
+    let pushed = push_crl(&mut file, &list, &args.push)?;
     match pushed.names.is_empty() {
         true => text.push_str(
-            "No node has the list yet. Push it to one, and it passes the list on:\n  sgc fleet revoke --router quic://…   \
+            "No node has the list yet. Push it to one, and it passes the list on:\n  sgc fleet revoke --push quic://…   \
              or, where a node runs:  sgc fleet revoke",
         ),
         false => {

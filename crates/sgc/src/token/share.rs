@@ -58,9 +58,9 @@ struct CreateArgs {
     /// How long the token is valid
     #[arg(long, value_name = "TIME", default_value = "90d", value_parser = valid)]
     valid: Duration,
-    /// Router at which the partner can reach this node; may be repeated [default: those of the configuration]
+    /// Router through which the partner reaches this node; may be repeated [default: those of the configuration]
     #[arg(long, value_name = "URL")]
-    router: Vec<String>,
+    via: Vec<String>,
     /// Print the token, its number, its end and its receiver as JSON
     #[arg(long)]
     json: bool,
@@ -317,16 +317,16 @@ fn recipient(to: &str) -> Result<(Vec<u8>, String, Option<NodeId>), CliError> {
 }
 
 fn routers(args: &CreateArgs, config: &Config) -> Result<Vec<String>, CliError> {
-    if args.router.is_empty() {
+    if args.via.is_empty() {
         // A partner on another local network cannot find a router by mDNS.
         let routers = config.routers.iter().filter(|url| !matches!(url, RouterUrl::Mdns(_)));
         return Ok(routers.take(TOKEN_ROUTERS_MAX).map(ToString::to_string).collect());
     }
     let valid = |url: &String| match url.parse::<LinkUrl>() {
         Ok(url) => Ok(url.to_string()),
-        Err(fault) => Err(CliError::Cannot { reason: format!("--router {url}: {fault}") }),
+        Err(fault) => Err(CliError::Cannot { reason: format!("--via {url}: {fault}") }),
     };
-    args.router.iter().map(valid).collect()
+    args.via.iter().map(valid).collect()
 }
 
 fn list(state: &Path, json: bool) -> Result<(), CliError> {

@@ -62,7 +62,7 @@ fn give(lab: &Lab, site: Site, topic: &str) -> Vec<u8> {
     };
     let router = format!("quic://{}", lab.cloud_address(other));
     let config = format!("{}.toml", site.name());
-    let args = ["token", "share", "create", "-c", &config, "--topic", topic, "--to", to, "--router", &router];
+    let args = ["token", "share", "create", "-c", &config, "--topic", topic, "--to", to, "--via", &router];
     let mut token = Vec::new();
     eventually(&format!("{config} gives {topic}"), || {
         let output = run(lab, &args, &[]);
