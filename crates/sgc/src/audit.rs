@@ -33,9 +33,9 @@ pub(crate) struct AuditArgs {
     /// Show only records of this topic
     #[arg(long, value_name = "/TOPIC")]
     topic: Option<String>,
-    /// Show only records of this peer, by its name in the node's configuration or the first digits of its node id
+    /// Show only records about this peer, by its name in the node's configuration or the first digits of its node id
     #[arg(long, value_name = "PEER")]
-    peer: Option<String>,
+    about: Option<String>,
     /// Show only this event, such as refused; may be repeated
     #[arg(long = "event", value_name = "EVENT", value_parser = event)]
     events: Vec<String>,
@@ -107,7 +107,7 @@ impl AuditArgs {
             record.peer_name.as_ref() == Some(wanted) || record.peer.as_ref().is_some_and(begins)
         };
         self.topic.as_ref().is_none_or(|topic| record.topic.as_ref() == Some(topic))
-            && self.peer.as_ref().is_none_or(is_peer)
+            && self.about.as_ref().is_none_or(is_peer)
             && (self.events.is_empty()
                 || self.events.contains(&record.event)
                 || record.of.as_ref().is_some_and(|of| self.events.contains(of)))

@@ -41,10 +41,10 @@ pub(crate) struct AnswerArgs {
     /// Identity file of a node, other than the measuring one's, as `sgc fleet enroll` writes it
     #[arg(long, value_name = "FILE")]
     identity: PathBuf,
-    /// Address to listen on, such as quic://0.0.0.0:7448; several separated by commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = listen_addr, required_unless_present = "router")]
+    /// Address to listen on, such as quic://0.0.0.0:7448; may be repeated, or several separated by commas
+    #[arg(long, value_name = "ADDRESS", value_delimiter = ',', value_parser = listen_addr, required_unless_present = "router")]
     listen: Vec<String>,
-    /// Router of yours instead; the other side has to name it too; several separated by commas
+    /// Router of yours instead; the other side has to name it too; may be repeated, or several separated by commas
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "listen")]
     router: Vec<String>,
     /// TCP and UDP port of the plain echo, for a firewall that has to open it; 0 lets the system choose
@@ -64,10 +64,10 @@ pub(crate) struct MeasureArgs {
     /// Name of the answering node
     #[arg(long, value_name = "NODE")]
     with: NodeName,
-    /// URL at which it listens, such as quic://desk.example:7448; several separated by commas
+    /// URL at which it listens, such as quic://desk.example:7448; may be repeated, or several separated by commas
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, required_unless_present = "router")]
     connect: Vec<String>,
-    /// Router of yours instead; the other side has to name it too; several separated by commas
+    /// Router of yours instead; the other side has to name it too; may be repeated, or several separated by commas
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "connect")]
     router: Vec<String>,
     /// Suites to measure, separated by commas

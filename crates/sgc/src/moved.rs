@@ -13,13 +13,17 @@ pub(crate) struct MovedArgs {
 }
 
 /// Options that have another name now: the command, the earlier spelling, and the present one.
-const MOVED_OPTIONS: [(&str, &str, &str); 9] = [
+const MOVED_OPTIONS: [(&str, &str, &str); 13] = [
+    ("sgc audit", "--peer", "--about"),
     ("sgc bench run", "--to", "--connect"),
     ("sgc fleet accept", "--node", "--node-name"),
     ("sgc fleet merge", "--router", "--push"),
     ("sgc fleet revoke", "--router", "--push"),
+    ("sgc fleet set", "--post-quantum false", "--no-post-quantum"),
+    ("sgc fleet set", "--post-quantum true", "--post-quantum"),
     ("sgc join", "--wait", "--timeout"),
     ("sgc name", "--node", "--ros-node"),
+    ("sgc policy test", "--publish", "--right publish"),
     ("sgc token share create", "--router", "--via"),
     ("sgc topic pub", "--wait", "--wait-subscribers"),
     ("sgc topic pub", "-w", "--wait-subscribers"),
@@ -27,11 +31,16 @@ const MOVED_OPTIONS: [(&str, &str, &str); 9] = [
 
 /// Returns the error that names the present option, if clap refused an earlier one of this command.
 pub(crate) fn moved_option(error: &clap::Error, called: &str) -> Option<CliError> {
-    if error.kind() != ErrorKind::UnknownArgument {
-        return None;
-    }
-    let Some(ContextValue::String(said)) = error.get(ContextKind::InvalidArg) else { return None };
-    let (_, old, new) = MOVED_OPTIONS.iter().find(|(command, old, _)| *command == called && old == said)?;
+    let refused = match error.kind() {
+        ErrorKind::UnknownArgument => ContextKind::InvalidArg,
+        // A value that the option had: --post-quantum=true.
+        ErrorKind::TooManyValues => ContextKind::InvalidValue,
+        _ => return None,
+    };
+    let Some(ContextValue::String(refused)) = error.get(refused) else { return None };
+    let is_refused = |old: &str| old.split(' ').next_back() == Some(refused);
+    let (_, old, new) =
+        MOVED_OPTIONS.iter().find(|(command, old, _)| *command == called && is_refused(old))?;
     Some(moved(*old, *new))
 }
 

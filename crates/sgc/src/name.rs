@@ -22,7 +22,7 @@ pub(crate) struct NameArgs {
     #[arg(long, value_name = "NODE")]
     owner: String,
     /// Full ROS 2 name of the topic, such as /camera/image
-    #[arg(long)]
+    #[arg(long, value_name = "/TOPIC")]
     topic: String,
     /// Type of the topic, such as sensor_msgs/msg/Image
     #[arg(long = "type", value_name = "TYPE")]

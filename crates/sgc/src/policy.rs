@@ -5,7 +5,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::{Args, Subcommand};
+use clap::{Args, Subcommand, ValueEnum};
 use serde::Serialize;
 use sgc_diagnosis::DiagnosisError;
 use sgc_node::config::{self, Config};
@@ -63,15 +63,22 @@ struct TestArgs {
     /// Type of the topic, if rules depend on it
     #[arg(long = "type", value_name = "TYPE")]
     type_name: Option<String>,
-    /// Test the right to publish instead of the right to subscribe
-    #[arg(long)]
-    publish: bool,
+    /// Right to test
+    #[arg(long, value_enum, value_name = "RIGHT", default_value = "subscribe")]
+    right: Right,
     /// Configuration of the owner; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Print the answer as JSON
     #[arg(long)]
     json: bool,
+}
+
+/// The right that is tested.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Right {
+    Subscribe,
+    Publish,
 }
 
 #[derive(Debug, Serialize)]
@@ -110,9 +117,9 @@ fn test(args: &TestArgs) -> Result<ExitCode, CliError> {
     let path = files::config_here(args.config.as_deref())?;
     let (config, identity, partners) = load(&path)?;
     let (who, subject) = subject(args, &config, &identity, &partners)?;
-    let (role, word) = match args.publish {
-        true => (Role::Publish, "publish on"),
-        false => (Role::Subscribe, "subscribe to"),
+    let (role, label, word) = match args.right {
+        Right::Publish => (Role::Publish, "publish", "publish on"),
+        Right::Subscribe => (Role::Subscribe, "subscribe", "subscribe to"),
     };
     let verdict = match &subject {
         Ok(subject) => verdict(args, &config, &identity, &partners, subject, role),
@@ -122,7 +129,7 @@ fn test(args: &TestArgs) -> Result<ExitCode, CliError> {
         permitted: verdict.permitted,
         node_id: subject.ok().map(|subject| subject.node.to_string()),
         topic: args.topic.clone(),
-        role: if args.publish { "publish" } else { "subscribe" },
+        role: label,
         because: verdict.because,
         who,
     };

@@ -44,8 +44,9 @@ pub(crate) struct RunArgs {
     #[arg(long, value_name = "FILE")]
     identity: Option<PathBuf>,
     /// Router to connect to: its address (quic://router.lab.example:7447), a domain with DNS SRV records
-    /// (srv://lab.example), or any router on the local network (mdns://); may be repeated
-    #[arg(long, value_name = "URL")]
+    /// (srv://lab.example), or any router on the local network (mdns://); may be repeated, or several separated by
+    /// commas
+    #[arg(long, value_name = "URL", value_delimiter = ',')]
     router: Vec<String>,
     /// Topic to share, as /TOPIC or /TOPIC=NODE,group:GROUP; the prefix service:, action: or parameters: shares that
     /// kind instead; may be repeated
@@ -59,8 +60,8 @@ pub(crate) struct RunArgs {
     /// NODE:service:/NAME; may be repeated
     #[arg(long = "use", value_name = "NODE:[KIND:]/NAME")]
     uses: Vec<String>,
-    /// Address on which to listen as a router, such as quic://0.0.0.0:7447; may be repeated
-    #[arg(long, value_name = "URL")]
+    /// Address on which to listen as a router, such as quic://0.0.0.0:7447; may be repeated, or several separated by commas
+    #[arg(long, value_name = "ADDRESS", value_delimiter = ',')]
     listen: Vec<String>,
     /// Announce this router on the local network by mDNS
     #[arg(long, requires = "listen")]
@@ -80,8 +81,8 @@ pub(crate) struct RouterArgs {
     /// Identity file, as `sgc fleet enroll --role router` writes it
     #[arg(long, value_name = "FILE")]
     identity: PathBuf,
-    /// Address to listen on, such as quic://0.0.0.0:7447; may be repeated
-    #[arg(long, value_name = "URL", required = true)]
+    /// Address to listen on, such as quic://0.0.0.0:7447; may be repeated, or several separated by commas
+    #[arg(long, value_name = "ADDRESS", value_delimiter = ',', required = true)]
     listen: Vec<String>,
     /// Other router to connect to, so that both form one mesh: quic://HOST:PORT, srv://DOMAIN or mdns://; may be
     /// repeated

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::os::unix::fs::PermissionsExt;
@@ -556,6 +557,11 @@ fn usage_errors_are_one_line_and_code_2() {
         (&["fleet", "merge", "b.fleet", "--router", "quic://r"], "--push"),
         (&["fleet", "revoke", "a", "--router", "quic://r"], "--push"),
         (&["token", "share", "create", "--topic", "/t", "--router", "quic://r"], "--via"),
+        (&["audit", "--peer", "ab"], "--about"),
+        (&["fleet", "set", "--post-quantum", "false"], "--no-post-quantum"),
+        (&["fleet", "set", "--post-quantum", "true"], "--post-quantum"),
+        (&["fleet", "set", "--post-quantum=true"], "--post-quantum"),
+        (&["policy", "test", "desk", "--topic", "/t", "--publish"], "--right publish"),
         (&["join", "--wait=1s"], "--timeout"),
         (&["name", "--owner", "a", "--node", "driver"], "--ros-node"),
         (&["topic", "pub", "/t", "--wait", "1"], "--wait-subscribers"),
@@ -767,7 +773,7 @@ fn fleet_commands_print_their_results_as_json() {
     };
     let made = json(&["fleet", "create", "lab", "--authority", "hub"]);
     assert_eq!((&made["file"], &made["authority"]), (&"lab.fleet".into(), &"hub".into()));
-    assert_eq!(json(&["fleet", "set", "--post-quantum", "true"])["post_quantum"], true);
+    assert_eq!(json(&["fleet", "set", "--post-quantum"])["post_quantum"], true);
 
     let enrolled = json(&["fleet", "enroll", "arm-1"]);
     let until = place.identity("arm-1.identity").not_after().to_string();
@@ -954,6 +960,37 @@ fn every_command_that_prints_data_takes_json() {
 }
 
 #[test]
+fn option_has_the_same_form_in_every_command() {
+    // For each option, the forms that commands give it, as their help shows them.
+    let mut forms: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    let mut shorts: BTreeMap<char, BTreeSet<String>> = BTreeMap::new();
+    for (name, command) in leaves(&sgc::command_line(), "") {
+        for arg in command.get_arguments().filter(|arg| !arg.is_hide_set()) {
+            let Some(long) = arg.get_long() else {
+                assert!(arg.is_positional(), "{name}: {} has a short form alone", arg.get_id());
+                continue;
+            };
+            let mut form = format!("{:?} --{long}", arg.get_short());
+            if arg.get_action().takes_values() {
+                let id = arg.get_id().as_str().to_uppercase();
+                let value = arg.get_value_names().map_or(id, |names| names.join(" "));
+                form.push_str(if arg.is_require_equals_set() { "=" } else { " " });
+                form.push_str(&value);
+            }
+            forms.entry(long.to_owned()).or_default().insert(form);
+            if let Some(short) = arg.get_short() {
+                shorts.entry(short).or_default().insert(long.to_owned());
+            }
+        }
+    }
+    assert!(forms.len() > 60 && shorts.len() > 5, "{forms:?} {shorts:?}");
+    forms.retain(|_, forms| forms.len() > 1);
+    assert!(forms.is_empty(), "{forms:#?}");
+    shorts.retain(|_, longs| longs.len() > 1);
+    assert!(shorts.is_empty(), "{shorts:#?}");
+}
+
+#[test]
 fn completions_and_man_pages_know_every_command() {
     let place = Place::new();
     for shell in ["bash", "zsh", "fish"] {
@@ -978,6 +1015,11 @@ fn arguments_that_make_no_node_are_told() {
     assert!(said.contains("command line: `--use` is \"desk/t\"; write NODE:/TOPIC: "), "{said}");
     assert!(said.contains("command line: neither `--router` nor `--listen` is given"), "{said}");
     assert!(said.ends_with("sgc: command line: 3 mistakes\n"), "{said}");
+    // Several routers and addresses are separated by commas, or the option is repeated.
+    for several in [&["--router", "a,b"][..], &["--router", "a", "--router", "b"]] {
+        let said = place.bad(2, &[&["run", "--identity", "arm-1.identity"], several].concat());
+        assert!(said.contains("`--router` is \"a\"; ") && said.contains("`--router` is \"b\"; "), "{said}");
+    }
     let args =
         ["router", "--identity", "cloud.identity", "--listen", "quic://127.0.0.1:0", "--log", "loud=x=y"];
     let said = place.bad(2, &args);

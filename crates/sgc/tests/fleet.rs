@@ -196,7 +196,7 @@ fn the_roster_is_shown() {
     assert!(json["nodes"][0]["revoked"].is_null() && json["nodes"][2]["revoked"].is_string());
     assert_eq!(arm.authority(), Some(place.fleet().node_id_of(&"desk".parse().unwrap())));
     assert!(arm.post_quantum());
-    let shown = place.good(&["fleet", "set", "--no-authority", "--post-quantum", "false"]);
+    let shown = place.good(&["fleet", "set", "--no-authority", "--no-post-quantum"]);
     assert!(shown.contains("authority none, post-quantum off"), "{shown}");
     assert!(place.identity("cloud.identity").as_peer().may_route && !arm.as_peer().may_route);
 }

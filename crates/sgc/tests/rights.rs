@@ -208,17 +208,17 @@ fn policy_is_answered_from_the_configuration_alone() {
     says(&["desk", "--group", "operators", "--topic", "/cmd_vel"], 0, by_group);
     says(&["--identity-file", "desk.identity", "--topic", "/cmd_vel"], 0, by_group);
     says(
-        &["desk", "--topic", "/cmd_vel", "--publish"],
+        &["desk", "--topic", "/cmd_vel", "--right", "publish"],
         0,
         "yes: desk may publish on /cmd_vel: `publish` names \"desk\": that is this node",
     );
     says(
-        &["desk", "--topic", "/handoff/pose", "--publish"],
+        &["desk", "--topic", "/handoff/pose", "--right", "publish"],
         1,
         "no: desk may not publish on /handoff/pose: `publish` of /handoff/pose names nobody",
     );
     says(
-        &["arm-1", "--topic", "/handoff/pose", "--publish"],
+        &["arm-1", "--topic", "/handoff/pose", "--right", "publish"],
         0,
         "yes: arm-1 may publish on /handoff/pose: it is the owner",
     );
@@ -734,7 +734,7 @@ fn a_token_hands_over_one_topic_and_is_taken_back() {
     let (code, text) = place.policy(&of_cart);
     assert_eq!((code, text.contains("token 1 was given for it")), (Some(0), true), "{text}");
     assert_eq!(place.policy(&["--identity-file", "cart.identity", "--topic", "/cmd_vel"]).0, Some(1));
-    assert_eq!(place.policy(&[&of_cart[..], &["--publish"]].concat()).0, Some(1));
+    assert_eq!(place.policy(&[&of_cart[..], &["--right", "publish"]].concat()).0, Some(1));
 
     // A running node is told by itself.
     let node = place.start("arm-1.toml");
@@ -972,7 +972,7 @@ fn the_audit_log_is_found_filtered_and_read_over_what_is_broken() {
         place.run(&[&["audit", "-c", "arm-1.toml", "--json"], args].concat()).stdout.lines().count()
     };
     assert_eq!(lines(&["--topic", "/cmd_vel"]), 1);
-    assert_eq!((lines(&["--peer", "abab"]), lines(&["--peer", "ac"])), (1, 0));
+    assert_eq!((lines(&["--about", "abab"]), lines(&["--about", "ac"])), (1, 0));
     assert_eq!(lines(&["--event", "started", "--event", "refused"]), 3);
     assert_eq!(lines(&["--since", "1h"]), 4);
     let said = place.bad(2, &["audit", "-c", "arm-1.toml", "--event", "no"]);

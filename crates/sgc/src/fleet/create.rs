@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::{ArgAction, Args};
+use clap::Args;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_diagnosis::check::FLEET_EXTENSION;
@@ -63,9 +63,12 @@ pub(super) struct SetArgs {
     /// Let no node renew certificates for the others
     #[arg(long)]
     no_authority: bool,
-    /// Make links and grants resist quantum computers, or not
-    #[arg(long, value_name = "true|false", action = ArgAction::Set)]
-    post_quantum: Option<bool>,
+    /// Make links and grants resist quantum computers
+    #[arg(long, conflicts_with = "no_post_quantum")]
+    post_quantum: bool,
+    /// Let links and grants do without that
+    #[arg(long)]
+    no_post_quantum: bool,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
@@ -150,8 +153,8 @@ pub(super) fn set(args: &SetArgs) -> Result<(), CliError> {
         let done = file.fleet.set_authority(authority, now);
         done.map_err(|e| file.error(e))?;
     }
-    if let Some(on) = args.post_quantum {
-        let done = file.fleet.set_post_quantum(on, now);
+    if args.post_quantum || args.no_post_quantum {
+        let done = file.fleet.set_post_quantum(args.post_quantum, now);
         done.map_err(|e| file.error(e))?;
     }
     file.save()?;

@@ -63,8 +63,8 @@ pub(crate) struct JoinArgs {
     /// Put the files where the service sgc@NAME looks for them
     #[arg(long, value_name = "NAME")]
     service: Option<String>,
-    /// Router to use in place of those that the code names; may be repeated
-    #[arg(long, value_name = "URL")]
+    /// Router to use in place of those that the code names; may be repeated, or several separated by commas
+    #[arg(long, value_name = "URL", value_delimiter = ',')]
     router: Vec<String>,
     /// Longest time to look for a router, such as 10min [default: 60s]
     #[arg(long, value_name = "TIME", value_parser = parse_span)]

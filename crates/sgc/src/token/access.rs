@@ -73,7 +73,7 @@ struct CreateArgs {
     #[arg(long, value_name = "TIME", default_value = "30d", value_parser = valid)]
     valid: Duration,
     /// Write the token into this file, mode 0600, instead of printing it
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Print the token, its id and its end as JSON
     #[arg(long, conflicts_with = "out")]

@@ -52,8 +52,8 @@ struct CreateArgs {
     /// Type of the topic, if neither the configuration nor a running node knows it
     #[arg(long = "type", value_name = "TYPE")]
     type_name: Option<String>,
-    /// CA certificate of the partner, PEM; with :NODE-ID appended, the token is for that node alone
-    #[arg(long, value_name = "CA.pem[:NODE-ID]")]
+    /// Receiver of the token: the CA certificate of the partner, PEM, for all its nodes, or CA.pem:NODE-ID for one
+    #[arg(long, value_name = "WHO")]
     to: String,
     /// How long the token is valid
     #[arg(long, value_name = "TIME", default_value = "90d", value_parser = valid)]

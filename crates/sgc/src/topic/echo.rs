@@ -32,7 +32,7 @@ pub(crate) struct EchoArgs {
     #[arg(long, conflicts_with = "raw")]
     json: bool,
     /// End after the first message
-    #[arg(long, conflicts_with = "count")]
+    #[arg(short = '1', long, conflicts_with = "count")]
     once: bool,
     /// End after N messages
     #[arg(short = 'n', long, value_name = "N")]
