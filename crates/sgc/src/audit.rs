@@ -15,6 +15,7 @@ use sgc_process::{ProcessError, unix_now};
 use crate::environment::environment;
 use crate::error::CliError;
 use crate::output;
+use crate::span::parse_span;
 
 const FILE_NAME: &str = "audit.jsonl";
 
@@ -40,7 +41,7 @@ pub(crate) struct AuditArgs {
     #[arg(long = "event", value_name = "EVENT", value_parser = event)]
     events: Vec<String>,
     /// Show only records of the last TIME, such as 90s, 15min, 1h or 7d
-    #[arg(long, value_name = "TIME", value_parser = time)]
+    #[arg(long, value_name = "TIME", value_parser = parse_span)]
     since: Option<Duration>,
     /// Print the lines of JSON as they are in the log
     #[arg(long)]
@@ -187,10 +188,6 @@ fn event(text: &str) -> Result<String, String> {
         true => Ok(text.to_owned()),
         false => Err(format!("events are {}", known.join(", "))),
     }
-}
-
-fn time(text: &str) -> Result<Duration, String> {
-    config::parse_duration(text).ok_or_else(|| "90s, 15min, 1h or 7d, for example".to_owned())
 }
 
 #[cfg(test)]

@@ -14,6 +14,15 @@ pub(crate) fn parse_span(text: &str) -> Result<Duration, String> {
     }
 }
 
+/// Parses a span of time that is no longer than `max`, which is whole days.
+pub(crate) fn parse_span_within(text: &str, max: Duration) -> Result<Duration, String> {
+    let span = parse_span(text)?;
+    match span <= max {
+        true => Ok(span),
+        false => Err(format!("at most {}d", max.as_secs() / 86_400)),
+    }
+}
+
 /// Parses a span of whole seconds that is no longer than `max`.
 pub(crate) fn parse_seconds(text: &str, max: u32) -> Result<u32, String> {
     let seconds = u32::try_from(parse_span(text)?.as_secs()).ok().filter(|seconds| *seconds <= max);

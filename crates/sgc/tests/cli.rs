@@ -615,9 +615,19 @@ fn time_without_unit_is_refused_with_its_unit() {
         &["demo", "--duration", "10"],
         &["fleet", "status", "--watch=10"],
         &["fleet", "enroll", "a", "--valid", "10"],
+        &["fleet", "invite", "a", "--within", "10"],
+        &["join", "--timeout", "10"],
+        &["audit", "--since", "10"],
+        &["token", "access", "create", "--for", "x", "--valid", "10"],
+        &["token", "share", "create", "--topic", "/t", "--to", "ca.pem", "--valid", "10"],
     ] {
         let said = place.bad(2, args);
         assert!(said.contains("a time has a unit: 10s; see `sgc "), "{args:?}: {said}");
+    }
+    for kind in [&["access", "create", "--for", "x"][..], &["share", "create", "--topic", "/t", "--to", "c"]]
+    {
+        let said = place.bad(2, &[&["token"], kind, &["--valid", "3651d"]].concat());
+        assert!(said.contains("for '--valid <TIME>': at most 3650d; see "), "{said}");
     }
     // The commands get as far as the node, which does not run.
     for args in [

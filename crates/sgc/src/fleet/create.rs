@@ -66,7 +66,7 @@ pub(super) struct SetArgs {
     /// Make links and grants resist quantum computers
     #[arg(long, conflicts_with = "no_post_quantum")]
     post_quantum: bool,
-    /// Let links and grants do without that
+    /// Do not make links and grants resist quantum computers
     #[arg(long)]
     no_post_quantum: bool,
     /// Print the result as JSON

@@ -11,7 +11,7 @@ use rand_core::RngCore as _;
 use serde::Serialize;
 use sgc_gateway::{ACCESS_VALID_MS_MAX, AccessGrant, Scope, TokenId};
 use sgc_node::audit::{self, AuditEvent, AuditRecord};
-use sgc_node::config::{self, Config};
+use sgc_node::config::Config;
 use sgc_node::{AccessRecord, AccessRecords};
 use sgc_process::{ProcessError, system_rng, unix_now};
 use sgc_wire::UnixMillis;
@@ -19,6 +19,7 @@ use sgc_wire::UnixMillis;
 use super::open;
 use crate::error::CliError;
 use crate::gateway::{self, Reach};
+use crate::span::parse_span_within;
 use crate::{files, output, reload};
 
 /// Number of digits of an id that a list shows.
@@ -246,7 +247,5 @@ fn short(id: &str) -> String {
 }
 
 fn valid(text: &str) -> Result<Duration, String> {
-    let max = Duration::from_millis(ACCESS_VALID_MS_MAX);
-    let time = config::parse_duration(text).filter(|time| !time.is_zero() && *time <= max);
-    time.ok_or_else(|| "12h, 90d, for example, and at most 3650d".to_owned())
+    parse_span_within(text, Duration::from_millis(ACCESS_VALID_MS_MAX))
 }

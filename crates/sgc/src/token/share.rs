@@ -19,6 +19,7 @@ use sgc_wire::{NodeId, UnixMillis};
 
 use super::open;
 use crate::error::CliError;
+use crate::span::parse_span_within;
 use crate::{output, reload};
 
 const VALID_MAX: Duration = Duration::from_secs(3650 * 86_400);
@@ -55,7 +56,7 @@ struct CreateArgs {
     /// Receiver of the token: the CA certificate of the partner, PEM, for all its nodes, or CA.pem:NODE-ID for one
     #[arg(long, value_name = "WHO")]
     to: String,
-    /// How long the token is valid
+    /// How long the token is valid, at most 3650d
     #[arg(long, value_name = "TIME", default_value = "90d", value_parser = valid)]
     valid: Duration,
     /// Router through which the partner reaches this node; may be repeated [default: those of the configuration]
@@ -365,6 +366,5 @@ fn reload_node(
 }
 
 fn valid(text: &str) -> Result<Duration, String> {
-    let time = config::parse_duration(text).filter(|time| !time.is_zero() && *time <= VALID_MAX);
-    time.ok_or_else(|| "12h, 90d, for example, and at most 3650d".to_owned())
+    parse_span_within(text, VALID_MAX)
 }
