@@ -44,6 +44,12 @@ fn page(mut program: Command) -> String {
          while it ran, and with 2 if its arguments or the configuration cannot be right.",
         0,
     ));
+    page.push('\n');
+    page.push_str(&wrapped(
+        "With `--json`, standard output has JSON alone: one document, or one in each line from a command that prints \
+         several results. Errors and remarks are text on standard error.",
+        0,
+    ));
     page.push_str("\n| command | result |\n|---|---|\n");
     let commands = leaves(&program, program.get_name());
     for (name, command) in &commands {
