@@ -136,7 +136,7 @@ pub fn command_line() -> clap::Command {
 fn called(args: impl Iterator<Item = String>) -> String {
     let mut command = &Cli::command();
     let mut called = command.get_name().to_owned();
-    for arg in args.skip(1) {
+    for arg in args.skip(1).filter(|arg| !arg.starts_with('-')) {
         let Some(found) = command.find_subcommand(&arg) else { break };
         command = found;
         called = format!("{called} {}", found.get_name());

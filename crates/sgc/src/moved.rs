@@ -48,3 +48,29 @@ pub(crate) fn moved_option(error: &clap::Error, called: &str) -> Option<CliError
 pub(crate) fn moved(old: impl Into<String>, new: impl Into<String>) -> CliError {
     CliError::Moved { old: old.into(), new: new.into() }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn present_options_exist_and_earlier_ones_do_not() {
+        for (command, old, new) in MOVED_OPTIONS {
+            let mut found = &crate::command_line();
+            for name in command.split(' ').skip(1) {
+                found = found.find_subcommand(name).expect(command);
+            }
+            let takes = |option: &str| {
+                let name = option.split(' ').next().unwrap_or_default();
+                found.get_arguments().any(|arg| {
+                    let short = arg.get_short().map(|short| format!("-{short}"));
+                    let long = arg.get_long().map(|long| format!("--{long}"));
+                    !arg.is_hide_set() && [short, long].iter().flatten().any(|form| form == name)
+                })
+            };
+            assert!(takes(new), "{command} {new}");
+            // An option that lost its value keeps its name.
+            assert!(!takes(old) || old.contains(' '), "{command} {old}");
+        }
+    }
+}

@@ -558,6 +558,7 @@ fn usage_errors_are_one_line_and_code_2() {
         (&["fleet", "revoke", "a", "--router", "quic://r"], "--push"),
         (&["token", "share", "create", "--topic", "/t", "--router", "quic://r"], "--via"),
         (&["audit", "--peer", "ab"], "--about"),
+        (&["--allow-core-dumps", "audit", "--peer", "ab"], "--about"),
         (&["fleet", "set", "--post-quantum", "false"], "--no-post-quantum"),
         (&["fleet", "set", "--post-quantum", "true"], "--post-quantum"),
         (&["fleet", "set", "--post-quantum=true"], "--post-quantum"),
