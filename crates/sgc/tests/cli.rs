@@ -874,6 +874,24 @@ fn fleet_commands_name_the_node_that_asks_an_authority_as_other_commands_do() {
 }
 
 #[test]
+fn reply_of_a_service_is_json_with_and_without_the_option() {
+    let place = Place::new();
+    let listener = UnixListener::bind(place.path().join("a.sock")).unwrap();
+    let node = std::thread::spawn(move || {
+        for _ in 0..2 {
+            let (mut stream, _) = listener.accept().unwrap();
+            BufReader::new(&stream).read_line(&mut String::new()).unwrap();
+            stream.write_all(b"{\"ok\":{\"sum\":5}}\n").unwrap();
+        }
+    });
+    for json in [&[][..], &["--json"]] {
+        let args = ["service", "call", "/add", "{a: 2, b: 3}", "--socket", "a.sock"];
+        assert_eq!(place.good(&[&args[..], json].concat()), "{\"sum\":5}\n");
+    }
+    node.join().unwrap();
+}
+
+#[test]
 fn validity_in_days_is_refused_with_its_span() {
     let place = Place::with_fleet();
     for verb in ["enroll", "renew"] {
