@@ -3,7 +3,7 @@
 //! Messages that left this node may wait in front of a router that stands still, or be lost with a link. The end of a
 //! share travels apart from them and would overtake them. So a source asks its sinks to confirm its last message.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
 use sgc_wire::{Name, NodeId, SourceId};
@@ -12,13 +12,22 @@ use sgc_wire::{Name, NodeId, SourceId};
 const CONFIRM_MAX: Duration = Duration::from_secs(30);
 /// Time for which a node that has lost its path counts among those that receive.
 const PATHLESS_COUNTS_FOR: Duration = Duration::from_secs(10);
+/// Most nodes and names of that time; beyond it the oldest are forgotten.
+const PATHLESS_MAX: usize = 4096;
 
 /// The closings of all sources of this node.
 #[derive(Default)]
 pub(crate) struct Closings {
     open: BTreeMap<Name, BTreeMap<SourceId, Closing>>,
-    /// Nodes that lost their paths of late.
-    pathless: BTreeMap<(Name, NodeId), Instant>,
+    /// Nodes that lost their paths of late, the oldest first.
+    pathless: VecDeque<Pathless>,
+}
+
+/// A node that received a name.
+struct Pathless {
+    name: Name,
+    node: NodeId,
+    since: Instant,
 }
 
 /// The closing of one source.
@@ -41,12 +50,12 @@ impl Closings {
         last: u64,
         subscribers: impl IntoIterator<Item = NodeId>,
     ) {
+        self.forget_pathless(now);
         let of_name = self.open.entry(name).or_default();
         if of_name.get(&source).is_some_and(|closing| closing.last == last) {
             return;
         }
-        self.pathless.retain(|_, since| *since + PATHLESS_COUNTS_FOR > now);
-        let pathless = self.pathless.keys().filter(|(of, _)| *of == name).map(|(_, node)| *node);
+        let pathless = self.pathless.iter().filter(|lost| lost.name == name).map(|lost| lost.node);
         let lacking = subscribers.into_iter().chain(pathless).collect();
         of_name.insert(source, Closing { last, until: now + CONFIRM_MAX, lacking });
     }
@@ -61,13 +70,23 @@ impl Closings {
 
     /// Notes that a node that receives lost its path, or left.
     pub(crate) fn lost_path(&mut self, now: Instant, name: Name, node: NodeId) {
-        self.pathless.retain(|_, since| *since + PATHLESS_COUNTS_FOR > now);
-        self.pathless.insert((name, node), now);
+        self.forget_pathless(now);
+        if self.pathless.len() >= PATHLESS_MAX {
+            self.pathless.pop_front();
+        }
+        self.pathless.push_back(Pathless { name, node, since: now });
+    }
+
+    /// Forgets the nodes that have been without a path for too long.
+    fn forget_pathless(&mut self, now: Instant) {
+        while self.pathless.front().is_some_and(|lost| lost.since + PATHLESS_COUNTS_FOR <= now) {
+            self.pathless.pop_front();
+        }
     }
 
     /// Waits no longer for a node that may not receive any more.
     pub(crate) fn cut(&mut self, name: &Name, node: &NodeId) {
-        self.pathless.remove(&(*name, *node));
+        self.pathless.retain(|lost| (&lost.name, &lost.node) != (name, node));
         let of_name = self.open.get_mut(name).into_iter().flat_map(BTreeMap::values_mut);
         for closing in of_name {
             closing.lacking.remove(node);
@@ -154,6 +173,12 @@ mod tests {
         assert!(!waits(&closings, now));
         closings.begin(now + PATHLESS_COUNTS_FOR, NAME, SOURCE, 2, []);
         assert!(!waits(&closings, now), "that was too long ago");
+        // The oldest give way.
+        closings.lost_path(now, NAME, node(1));
+        (0..PATHLESS_MAX).for_each(|_| closings.lost_path(now, Name([9; 32]), node(2)));
+        assert_eq!(closings.pathless.len(), PATHLESS_MAX);
+        closings.begin(now, NAME, SOURCE, 3, []);
+        assert!(!waits(&closings, now));
     }
 
     #[test]
