@@ -144,6 +144,10 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::Confirmed { name, source, peer, seq } => {
                 self.closings.confirmed(&name, &source, &peer, seq);
+                if let Some(share) = self.shares.get(&name) {
+                    let mut subscribers = self.endpoint.subscribers(&name);
+                    share.ask_in_marks(!subscribers.all(|node| self.closings.confirms(&node)));
+                }
             }
             Event::Granted { name, sink, grant } => {
                 debug!(name = %name.short(), epoch = grant.epoch, "granted");
@@ -179,6 +183,9 @@ impl<N: RosNetwork> Core<N> {
                 self.refused.forget(&name, &peer);
                 if role == Role::Subscribe || routes.is_service(&name) {
                     routes.handle_sink_joined(&name, sink);
+                }
+                if let Some(share) = self.shares.get(&name).filter(|_| !self.closings.confirms(&peer)) {
+                    share.ask_in_marks(true);
                 }
                 self.consumers.sink_joined(now.instant, peer, name, sink, role);
             }

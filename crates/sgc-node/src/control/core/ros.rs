@@ -146,8 +146,7 @@ impl<N: RosNetwork> Core<N> {
     fn close_source(&mut self, now: Instant, name: Name, source: SourceId) {
         let Some(share) = self.shares.get(&name) else { return };
         let Some(last) = share.last_to_confirm(&source) else { return };
-        self.closings.begin(now, name, source, last, self.endpoint.subscribers(&name));
-        if self.closings.unconfirmed(now, &name).any(|waiting| waiting == source) {
+        if self.closings.wait_for(now, name, source, last, self.endpoint.subscribers(&name)) {
             share.ask_for_confirmation(&source);
         }
     }
@@ -179,7 +178,7 @@ impl<N: RosNetwork> Core<N> {
         for source in self.closings.of(&name).collect::<Vec<_>>() {
             self.close_source(now, name, source);
         }
-        self.closings.unconfirmed(now, &name).next().is_some()
+        self.closings.is_waiting(now, &name)
     }
 
     fn leave(&mut self, now: Now, name: Name) {

@@ -56,6 +56,8 @@ pub(crate) struct LocalShare {
     taps: Taps,
     /// Whether a task looks for liveliness assertions.
     is_watched: AtomicBool,
+    /// Whether the marks of a silence ask for confirmations.
+    asks_in_marks: AtomicBool,
     /// Whether the reader's worker publishes a sample, or has another at hand.
     is_publishing: AtomicBool,
 }
@@ -86,6 +88,7 @@ impl LocalShare {
             map: ArcSwap::default(),
             taps: Taps::default(),
             is_watched: AtomicBool::new(false),
+            asks_in_marks: AtomicBool::new(false),
             is_publishing: AtomicBool::new(false),
         }
     }
@@ -381,6 +384,11 @@ impl LocalShare {
         });
     }
 
+    /// Has the marks of a silence ask for confirmations, or not: so it becomes known which nodes give any.
+    pub(crate) fn ask_in_marks(&self, asks: bool) {
+        self.asks_in_marks.store(asks, Relaxed);
+    }
+
     /// Lets silent sources announce their last message. Returns `false` if none has to before the next message.
     pub(crate) fn look_for_silence(self: &Arc<Self>, now: Instant) -> bool {
         self.seal.look_for_silence(now, &self.map.load(), |slot| {
@@ -389,7 +397,10 @@ impl LocalShare {
                 self.run_blocking(move || {
                     // The holder of the source is about to publish.
                     if let Ok(mut source) = slot.source.try_lock() {
-                        source.mark(share.emit.packets());
+                        match share.asks_in_marks.load(Relaxed) {
+                            true => source.ask_for_confirmation(share.emit.packets()),
+                            false => source.mark(share.emit.packets()),
+                        }
                     }
                 });
             }
