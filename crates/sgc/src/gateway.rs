@@ -54,8 +54,11 @@ struct CertificateArgs {
 struct Answer {
     /// The URLs at which clients connect.
     urls: Vec<String>,
-    #[serde(flatten)]
-    shown: ShownCertificate,
+    /// The pin of the certificate's key.
+    pin: String,
+    /// The names for which the certificate holds.
+    names: Vec<String>,
+    expires: String,
     /// Whether the gateway made the certificate itself.
     own: bool,
     /// The certificates that clients trust.
@@ -80,7 +83,9 @@ fn certificate(args: &CertificateArgs) -> Result<(), CliError> {
         return Ok(output::raw(&pem)?);
     }
     if args.json {
-        let answer = Answer { urls: reach.urls, shown, own: certificate.is_own, pem };
+        let ShownCertificate { pin, names, until } = shown;
+        let (urls, expires, own) = (reach.urls, UnixMillis(until).to_string(), certificate.is_own);
+        let answer = Answer { urls, pin, names, expires, own, pem };
         return output::json(&answer);
     }
     let mut rows: Vec<_> = reach.urls.iter().map(|url| vec!["url".to_owned(), url.clone()]).collect();

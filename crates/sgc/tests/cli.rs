@@ -668,7 +668,9 @@ fn name_ca_and_access_token_are_printed_as_json() {
     let json = parsed(&ran.stdout);
     assert_eq!((ran.code, &json["for"]), (Some(0), &"x".into()), "{}", ran.stderr);
     let listed = parsed(&place.good(&["token", "access", "list", "--json"]));
-    assert_eq!(listed[0]["id"], json["id"]);
+    for key in ["id", "for", "expires"] {
+        assert_eq!(listed[0][key], json[key], "{key}");
+    }
     assert!(json["token"].as_str().is_some_and(|token| !token.is_empty()));
 }
 

@@ -532,6 +532,7 @@ fn certificate_from_files_is_shown_with_its_pin_and_check_warns_before_its_end()
     let json = place.good(&["gateway", "certificate", "-c", "arm-1.toml", "--json"]);
     let json: Value = serde_json::from_str(&json).unwrap();
     assert_eq!(json["pin"], sgc_trust::certificate_pin(made.server()).unwrap());
+    assert!(json["expires"].as_str().is_some_and(|time| time.ends_with('Z')), "{json}");
     assert_eq!((&json["own"], &json["urls"][0]), (&Value::Bool(false), &"wss://robot.example:9443".into()));
     assert!(!place.path("state/gateway-certificate.pem").exists());
     let said = place.good(&["check", "-c", "arm-1.toml"]);

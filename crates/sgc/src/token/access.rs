@@ -105,6 +105,31 @@ struct RevokeArgs {
     json: bool,
 }
 
+/// A token as `list --json` shows it.
+#[derive(Serialize)]
+struct TokenJson<'a> {
+    id: &'a str,
+    #[serde(rename = "for")]
+    label: &'a str,
+    subscribe: &'a [String],
+    publish: &'a [String],
+    call: &'a [String],
+    serve: &'a [String],
+    created: String,
+    expires: String,
+    /// `None` if it is not revoked.
+    revoked: Option<String>,
+}
+
+impl<'a> TokenJson<'a> {
+    fn new(record: &'a AccessRecord) -> Self {
+        let AccessRecord { id, label, subscribe, publish, call, serve, created, expires, revoked } = record;
+        let time = |ms| UnixMillis(ms).to_string();
+        let (created, expires, revoked) = (time(*created), time(*expires), revoked.map(time));
+        Self { id, label, subscribe, publish, call, serve, created, expires, revoked }
+    }
+}
+
 /// A revoked token as `--json` shows it.
 #[derive(Serialize)]
 struct RevokedJson<'a> {
@@ -200,7 +225,7 @@ fn list(args: &ListArgs) -> Result<(), CliError> {
     let mut records = AccessRecords::load(&state)?;
     records.tokens.retain(|record| record.expires >= now.0);
     if args.json {
-        return output::json(&records.tokens);
+        return output::json(&records.tokens.iter().map(TokenJson::new).collect::<Vec<_>>());
     }
     if records.tokens.is_empty() {
         return output::line("no access token was made here that has not ended");
