@@ -63,6 +63,7 @@ use crate::data::dataplane::DataPlane;
 use crate::data::outflow::OutFlow;
 use crate::data::sending::message_keys::MessageKeys;
 use crate::data::sending::replays::Replays;
+use crate::data::sending::share::DueMark;
 use crate::data::sinks::SinkRequest;
 use crate::data::stats::Drops;
 use crate::data::tap::TapQueue;
@@ -99,6 +100,8 @@ pub(crate) struct Core<N: RosNetwork> {
     forwards: ForwardTable,
     shares: Shares,
     closings: Closings,
+    /// Marks that ask for confirmations.
+    questions: Vec<DueMark>,
     /// Wanted readers and writers of the local network.
     ends: NetworkEnds,
     sinks: Sinks,
@@ -231,6 +234,7 @@ impl<N: RosNetwork> Core<N> {
             forwards: ForwardTable::default(),
             shares,
             closings: Closings::default(),
+            questions: Vec::new(),
             ends: NetworkEnds::default(),
             sinks: Sinks::new(requests, data),
             services,
@@ -307,6 +311,7 @@ impl<N: RosNetwork> Core<N> {
             }
             self.handle_timeouts();
             deadline = self.drain();
+            DueMark::publish_all(std::mem::take(&mut self.questions));
             self.show_graph();
         }
     }

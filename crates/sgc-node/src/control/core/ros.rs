@@ -147,7 +147,7 @@ impl<N: RosNetwork> Core<N> {
         let Some(share) = self.shares.get(&name) else { return };
         let Some(last) = share.last_to_confirm(&source) else { return };
         if self.closings.wait_for(now, name, source, last, self.endpoint.subscribers(&name)) {
-            share.ask_for_confirmation(&source);
+            self.questions.extend(share.question(&source));
         }
     }
 

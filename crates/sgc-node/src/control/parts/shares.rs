@@ -9,7 +9,7 @@ use sgc_wire::Name;
 use tokio::sync::{Notify, mpsc};
 
 use crate::data::dataplane::DataPlane;
-use crate::data::sending::share::LocalShare;
+use crate::data::sending::share::{DueMark, LocalShare};
 
 /// Interval of checks for sources that may have fallen silent.
 const SILENCE_LOOK: Duration = Duration::from_secs(1);
@@ -79,10 +79,12 @@ impl Shares {
     /// Looks for sources that have fallen silent, if that is due.
     pub(crate) fn look_for_silence(&mut self, now: Instant) {
         if self.silence_due.is_none_or(|at| at <= now) {
-            let looks = self.shares.values().map(|share| share.look_for_silence(now));
+            let mut due = Vec::new();
+            let looks = self.shares.values().map(|share| share.look_for_silence(now, &mut due));
             // `fold` looks at all of them, where `any` would stop at the first.
             let busy = looks.fold(false, |any, busy| any | busy);
             self.silence_due = busy.then(|| now + SILENCE_LOOK);
+            DueMark::publish_all(due);
         }
     }
 

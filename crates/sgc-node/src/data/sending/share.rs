@@ -62,6 +62,38 @@ pub(crate) struct LocalShare {
     is_publishing: AtomicBool,
 }
 
+/// A source that has to announce its last message.
+pub(crate) struct DueMark {
+    share: Arc<LocalShare>,
+    slot: SourceSlot,
+    /// Whether it asks for confirmations.
+    asks: bool,
+}
+
+impl DueMark {
+    /// Publishes the marks. Those that need not wait for a link share a thread, because all topics of a program end at
+    /// one moment, and may fall silent at one.
+    pub(crate) fn publish_all(due: Vec<Self>) {
+        let (ready, rest): (Vec<_>, Vec<_>) = due.into_iter().partition(|due| due.share.emit.has_headroom());
+        if let Some(share) = ready.first().map(|due| due.share.clone()) {
+            share.run_blocking(move || ready.iter().for_each(Self::publish));
+        }
+        for due in rest {
+            let share = due.share.clone();
+            share.run_blocking(move || due.publish());
+        }
+    }
+
+    fn publish(&self) {
+        // The holder of the source is about to publish, and marks are repeated.
+        let Ok(mut source) = self.slot.source.try_lock() else { return };
+        match self.asks {
+            true => source.ask_for_confirmation(self.share.emit.packets()),
+            false => source.mark(self.share.emit.packets()),
+        }
+    }
+}
+
 impl LocalShare {
     /// Returns the sources. [`Self::set_map`] replaces them as a whole.
     pub(crate) fn map(&self) -> Arc<SourceMap> {
@@ -372,16 +404,11 @@ impl LocalShare {
         Some(progress.last_message()).filter(|last| progress.recovers() && *last > 0)
     }
 
-    /// Asks the sinks of a source to confirm that they have everything, if there is a path to any.
-    pub(crate) fn ask_for_confirmation(self: &Arc<Self>, source: &SourceId) {
-        let Some(slot) = self.map.load().slot(source).filter(|_| self.emit.is_wanted()) else { return };
-        let share = self.clone();
-        self.run_blocking(move || {
-            // The holder of the source is about to publish, and the question is repeated.
-            if let Ok(mut source) = slot.source.try_lock() {
-                source.ask_for_confirmation(share.emit.packets());
-            }
-        });
+    /// Returns the mark by which a source asks its sinks to confirm that they have everything, if there is a path to
+    /// any.
+    pub(crate) fn question(self: &Arc<Self>, source: &SourceId) -> Option<DueMark> {
+        let slot = self.map.load().slot(source).filter(|_| self.emit.is_wanted())?;
+        Some(DueMark { share: self.clone(), slot, asks: true })
     }
 
     /// Has the marks of a silence ask for confirmations, or not: so it becomes known which nodes give any.
@@ -389,20 +416,13 @@ impl LocalShare {
         self.asks_in_marks.store(asks, Relaxed);
     }
 
-    /// Lets silent sources announce their last message. Returns `false` if none has to before the next message.
-    pub(crate) fn look_for_silence(self: &Arc<Self>, now: Instant) -> bool {
+    /// Adds to `due` the marks of sources that have been silent. Returns `false` if none will have one before the next
+    /// message.
+    pub(crate) fn look_for_silence(self: &Arc<Self>, now: Instant, due: &mut Vec<DueMark>) -> bool {
+        let asks = self.asks_in_marks.load(Relaxed);
         self.seal.look_for_silence(now, &self.map.load(), |slot| {
             if self.emit.is_wanted() {
-                let (share, slot) = (self.clone(), slot.clone());
-                self.run_blocking(move || {
-                    // The holder of the source is about to publish.
-                    if let Ok(mut source) = slot.source.try_lock() {
-                        match share.asks_in_marks.load(Relaxed) {
-                            true => source.ask_for_confirmation(share.emit.packets()),
-                            false => source.mark(share.emit.packets()),
-                        }
-                    }
-                });
+                due.push(DueMark { share: self.clone(), slot: slot.clone(), asks });
             }
         })
     }

@@ -3,21 +3,22 @@
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use sgc_endpoint::{Delivery, Sink, SinkLimits};
 use sgc_ros::{HandleSamples, Sample, SampleKind, Shaping};
 use sgc_sync::lock;
-use sgc_wire::{PayloadEncoding, PayloadForm};
+use sgc_wire::{PayloadEncoding, PayloadForm, TopicGrant};
 
 use crate::clock::unix_ns;
 use crate::data::conversion::KnownType;
 use crate::data::dataplane::DataPlane;
 use crate::data::pending::PENDING_BYTES_MAX;
 use crate::data::sending::fixtures::{
-    KNOWN, STRANGER, add_link, add_tree, grant, map_of, queued, sample, share, text_type, unflushed,
-    wait_until,
+    KNOWN, NAME, SINK, STRANGER, add_link, add_tree, grant, map_of, queued, sample, share, text_type,
+    unflushed, wait_until,
 };
 use crate::data::sending::hold::{Downstream as _, EARLY_SAMPLES_MAX};
 use crate::data::sending::intake::Publisher;
-use crate::data::sending::share::AT_HAND_BYTES_MAX;
+use crate::data::sending::share::{AT_HAND_BYTES_MAX, DueMark};
 use crate::data::stats::CountDrops;
 
 #[test]
@@ -226,13 +227,38 @@ fn a_share_is_looked_at_until_its_silence_was_told_three_times() {
     let _inside = runtime.enter();
     let (_, share, slot) = share();
     let begin = Instant::now();
-    let at = |seconds| begin + Duration::from_secs(seconds);
-    assert!(!share.look_for_silence(at(0)), "nothing was published");
+    let mut due = Vec::new();
+    let mut look = |seconds| share.look_for_silence(begin + Duration::from_secs(seconds), &mut due);
+    assert!(!look(0), "nothing was published");
     for _ in 0..2 {
         share.publish(sample(KNOWN, false));
-        assert!(share.look_for_silence(at(100)) && share.look_for_silence(at(102)));
-        assert!(share.look_for_silence(at(105)) && share.look_for_silence(at(114)));
-        assert!(!share.look_for_silence(at(116)) && !share.look_for_silence(at(900)));
+        assert!(look(100) && look(102) && look(105) && look(114));
+        assert!(!look(116) && !look(900));
     }
+    assert!(due.is_empty());
     assert_eq!(slot.progress.published(), 2, "without anybody who listens nothing is said");
+}
+
+#[test]
+fn marks_of_a_silence_ask_for_confirmations_if_they_are_to() {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let _inside = runtime.enter();
+    let (data, share, slot) = share();
+    let flow = add_link(&data);
+    let announced = TopicGrant { sources: vec![slot.progress.announce()], ..grant(1) };
+    let mut sink = Sink::new(NAME, SINK, announced, false, SinkLimits::default());
+    let begin = Instant::now();
+    let at = |seconds| begin + Duration::from_secs(seconds);
+    for (asks, number) in [(true, 2), (false, 4)] {
+        share.ask_in_marks(asks);
+        share.publish(sample(KNOWN, false));
+        assert!(matches!(sink.handle_packet(&queued(&flow).unwrap()), Ok(Delivery::Message(_))));
+        let mut due = Vec::new();
+        assert!([100, 102].iter().all(|seconds| share.look_for_silence(at(*seconds), &mut due)));
+        assert_eq!(due.len(), 1);
+        DueMark::publish_all(due);
+        wait_until(|| !flow.is_empty());
+        let expected = if asks { Delivery::Confirm(slot.id, number) } else { Delivery::Mark };
+        assert_eq!(sink.handle_packet(&queued(&flow).unwrap()), Ok(expected));
+    }
 }
