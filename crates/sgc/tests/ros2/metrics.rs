@@ -74,7 +74,13 @@ fn promtool(lab: &Lab) -> Command {
 fn prometheus_scrapes_the_messages_of_ros_2_and_sees_a_node_die() {
     let [robot, desk] = robot_to_desk("topic", ["/load"]);
     let node = format!("127.0.0.1:{}", sgc_testkit::unused_port());
-    let mut lab = Lab::real(PLAN, [robot, format!("{desk}[metrics]\nlisten = \"{node}\"\n")]);
+    let mut lab = Lab::silent(PLAN, [robot, format!("{desk}[metrics]\nlisten = \"{node}\"\n")]);
+    for site in [Site::Robot, Site::Desk] {
+        lab.reconfigure(site, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
+    }
+    // Without one the node has an alert.
+    lab.reconfigure(Site::Desk, "[node]\n", "[node]\nstate = \"desk.state\"\n");
+    lab.start_all();
     let prometheus = Prometheus::start(&lab, &node);
     let [talks, listens] = PAIRS[0];
     let common = ["--topic", "/load", "--timeout", PLAN.peer_life];
