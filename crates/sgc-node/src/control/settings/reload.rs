@@ -529,44 +529,28 @@ impl Reloader {
 /// next reload reports them again.
 fn merged(before: Config, read: Config) -> Config {
     let authority = match fleet_of(&before) == fleet_of(&read) {
-        true => read.authority.clone(),
-        false => before.authority.clone(),
+        true => read.authority,
+        false => before.authority,
     };
-    let Config {
-        routers,
-        shares,
-        uses,
-        tokens,
-        partners,
-        trust,
-        accept,
-        gateway,
-        metrics,
-        observers,
-        peer_rate,
-        audit,
-        rotation,
-        ..
-    } = read;
-    let gateway = match (&before.gateway, gateway) {
+    let gateway = match (&before.gateway, read.gateway) {
         (Some(before), Some(after)) => Some(with_buffers_of(before, &after)),
         (_, after) => after,
     };
     Config {
-        routers,
-        shares,
-        uses,
-        tokens,
-        partners,
-        trust,
-        accept,
-        gateway,
-        metrics,
-        observers,
-        peer_rate,
-        audit,
-        rotation,
+        routers: read.routers,
+        shares: read.shares,
+        uses: read.uses,
+        tokens: read.tokens,
+        partners: read.partners,
+        trust: read.trust,
+        accept: read.accept,
+        metrics: read.metrics,
+        observers: read.observers,
+        peer_rate: read.peer_rate,
+        audit: read.audit,
+        rotation: read.rotation,
         authority,
+        gateway,
         ..before
     }
 }

@@ -34,7 +34,7 @@ pub(crate) struct Rules {
     pub(crate) members: MemberNames,
     /// The peers that may ask this node how it is doing.
     pub(crate) observers: Grantees,
-    /// Who may change the fleet, if this node is its authority.
+    /// The nodes that may change the fleet, if this node is its authority.
     pub(crate) operators: Grantees,
     /// The rights in the words of the configuration, for observers.
     pub(crate) rights: Arc<ReportRights>,
