@@ -102,6 +102,11 @@ impl<T> PendingQueue<T> {
         std::mem::take(&mut self.items)
     }
 
+    /// Iterates over the items, the oldest first.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = &T> {
+        self.items.iter().map(|pending| &pending.item)
+    }
+
     /// Returns the number of items.
     pub(crate) fn len(&self) -> usize {
         self.items.len()

@@ -149,8 +149,12 @@ impl HoldStage {
 }
 
 impl Inbox {
-    /// Passes a sample on, and notes a batch that stays open. Returns the sample if it has to wait.
+    /// Passes a sample on, and notes a batch that stays open. Returns the sample if it has to wait: also behind an earlier
+    /// one of its writer, which may have become known since that one was looked at.
     fn pass(&mut self, sample: Sample, more: bool, next: &impl Downstream) -> Option<Sample> {
+        if self.early.iter().any(|earlier| earlier.writer == sample.writer) {
+            return Some(sample);
+        }
         match next.pass(sample, more) {
             PassOutcome::Done => {}
             PassOutcome::Open(slot) => {
@@ -186,6 +190,8 @@ mod tests {
         known: RefCell<Vec<Guid>>,
         awaits_type: Cell<bool>,
         keeps_history: Cell<bool>,
+        /// Looks at samples of strangers after which they are known.
+        known_after: Cell<usize>,
         /// Time stamps of sent samples; 0 is the end of a batch.
         sent: RefCell<Vec<i64>>,
         dropped: RefCell<Vec<Dropped>>,
@@ -198,6 +204,7 @@ mod tests {
                 known: vec![KNOWN].into(),
                 awaits_type: Cell::new(false),
                 keeps_history: Cell::new(false),
+                known_after: Cell::new(usize::MAX),
                 sent: RefCell::default(),
                 dropped: RefCell::default(),
             }
@@ -208,6 +215,10 @@ mod tests {
         fn pass(&self, sample: Sample, more: bool) -> PassOutcome {
             let is_known = sample.writer.is_some_and(|writer| self.known.borrow().contains(&writer));
             if !is_known || self.awaits_type.get() {
+                self.known_after.set(self.known_after.get().saturating_sub(1));
+                if self.known_after.get() == 0 {
+                    self.known.borrow_mut().push(STRANGER);
+                }
                 return PassOutcome::Waits(sample);
             }
             self.sent.borrow_mut().push(sample.source_timestamp_ns);
@@ -253,6 +264,21 @@ mod tests {
         next.awaits_type.set(false);
         stage.publish_early(&next);
         assert_eq!((next.sent.take(), stage.has_waiting()), (vec![5, 0], false));
+    }
+
+    #[test]
+    fn writer_that_becomes_known_between_two_looks_keeps_its_order() {
+        for looks in 1..10 {
+            let (stage, next) = (HoldStage::new(Arc::default()), Recorder::new());
+            (1..=3).for_each(|timestamp| stage.publish(dated(STRANGER, timestamp, true), &next));
+            assert!(next.sent.take().is_empty());
+            next.known_after.set(looks);
+            stage.publish(dated(STRANGER, 4, true), &next);
+            stage.publish(dated(STRANGER, 5, true), &next);
+            next.known.borrow_mut().push(STRANGER);
+            stage.publish_early(&next);
+            assert_eq!(next.sent.take(), [1, 2, 3, 4, 5, 0], "known after {looks} looks");
+        }
     }
 
     #[test]
