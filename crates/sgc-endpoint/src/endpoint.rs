@@ -97,6 +97,7 @@ impl Endpoint {
             Control::Probe { .. } => cx.unexpected(UnexpectedFrame::Probe),
             Control::Clock { .. } => cx.unexpected(UnexpectedFrame::Clock),
             Control::IdentityInUse { .. } => cx.unexpected(UnexpectedFrame::IdentityInUse),
+            Control::ObservedAddress { .. } => cx.unexpected(UnexpectedFrame::ObservedAddress),
             Control::LaneOffer { .. }
             | Control::LaneAnswer { .. }
             | Control::LaneWanted { .. }

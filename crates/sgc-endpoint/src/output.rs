@@ -276,6 +276,8 @@ pub enum UnexpectedFrame {
     Clock,
     /// A notice that another node uses the identity.
     IdentityInUse,
+    /// An observed address, which goes over one link.
+    ObservedAddress,
     /// A frame about lanes.
     Lane,
     /// A notice of a better route for a sink that this node does not have.
@@ -307,6 +309,7 @@ impl fmt::Display for UnexpectedFrame {
             Self::Probe => "probe",
             Self::Clock => "clock",
             Self::IdentityInUse => "identity",
+            Self::ObservedAddress => "address",
             Self::Lane => "lane",
             Self::Reroute => "reroute",
             Self::Answer => "answer",

@@ -190,7 +190,19 @@ pub enum Control {
         /// The place of the other process, as the sender sees it.
         place: Place,
     },
+    /// The address from which the receiver's packets come: another than its own behind a NAT (RFC 4787). Only between
+    /// the two nodes of a link, to the one that dialled, if its [minor version](Hello::minor) is at least
+    /// [`MINOR_OBSERVED_ADDRESS`].
+    ObservedAddress {
+        /// The address, as the sender sees it.
+        place: Place,
+    },
 }
+
+/// The minor version of this protocol.
+pub const MINOR_VERSION: u16 = MINOR_OBSERVED_ADDRESS;
+/// The first minor version that knows [`Control::ObservedAddress`].
+pub const MINOR_OBSERVED_ADDRESS: u16 = 1;
 
 /// An address and a port of a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -199,6 +211,19 @@ pub struct Place {
     pub ip: [u8; 16],
     /// The port.
     pub port: u16,
+}
+
+impl Encode for Place {
+    fn encode(&self, w: &mut Writer) {
+        w.raw(&self.ip);
+        w.u16(self.port);
+    }
+}
+
+impl Decode for Place {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(Self { ip: r.array("address")?, port: r.u16()? })
+    }
 }
 
 impl From<SocketAddr> for Place {
@@ -220,7 +245,7 @@ impl From<Place> for SocketAddr {
 /// The first frame of a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Hello {
-    /// Minor version of the protocol; the transport negotiates the major one.
+    /// Minor version of the protocol ([`MINOR_VERSION`]); the transport negotiates the major one.
     pub minor: u16,
     /// Random number of this run of the process: another number voids all state of the last run.
     pub incarnation: u64,
@@ -844,8 +869,11 @@ impl Encode for Control {
             }
             Self::IdentityInUse { place } => {
                 w.u8(27);
-                w.raw(&place.ip);
-                w.u16(place.port);
+                place.encode(w);
+            }
+            Self::ObservedAddress { place } => {
+                w.u8(29);
+                place.encode(w);
             }
         }
     }
@@ -894,7 +922,8 @@ impl Decode for Control {
             25 => Self::LaneWanted { name: Name::decode(r)? },
             28 => Self::BulkLaneWanted { name: Name::decode(r)? },
             26 => Self::Clock { time: UnixMillis::decode(r)? },
-            27 => Self::IdentityInUse { place: Place { ip: r.array("address")?, port: r.u16()? } },
+            27 => Self::IdentityInUse { place: Place::decode(r)? },
+            29 => Self::ObservedAddress { place: Place::decode(r)? },
             v => return Err(DecodeError::value("control frame", v.into())),
         })
     }
@@ -942,6 +971,7 @@ mod tests {
             Control::BulkLaneWanted { name },
             Control::Clock { time: UnixMillis(79) },
             Control::IdentityInUse { place: Place { ip: [5; 16], port: 7447 } },
+            Control::ObservedAddress { place: Place { ip: [6; 16], port: 40_123 } },
         ]
     }
 

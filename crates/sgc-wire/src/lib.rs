@@ -32,9 +32,9 @@ pub use consumers::{CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer};
 pub use control::{
     ADJACENCIES_MAX, ADVERT_NAMES_MAX, ASK_BYTES_MAX, ATTACHED_MAX, Adjacency, AdvertBody, Answer,
     AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX, CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX,
-    Control, Hello, JoinBody, LinkStateBody, NAMES_PER_FRAME_MAX, Place, REPLY_KEY_BYTES_MAX, Recover,
-    RefuseReason, RejectReason, Request, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX,
-    SignedBody, SourceOffer,
+    Control, Hello, JoinBody, LinkStateBody, MINOR_OBSERVED_ADDRESS, MINOR_VERSION, NAMES_PER_FRAME_MAX,
+    Place, REPLY_KEY_BYTES_MAX, Recover, RefuseReason, RejectReason, Request, Role, SEALED_BYTES_MAX,
+    SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX, SignedBody, SourceOffer,
 };
 pub use ids::{
     Blind, GroupTag, LABELS_MAX, Label, LaneToken, Name, NodeId, NodeTag, Now, ParseIdError, Pseudonym,

@@ -61,6 +61,7 @@ fn control_frames_survive_mutation() {
         }),
         Control::Clock { time: UnixMillis(7) },
         Control::IdentityInUse { place: Place { ip: [8; 16], port: 9 } },
+        Control::ObservedAddress { place: Place { ip: [8; 16], port: 10 } },
         Control::Advert { cost: 1, signed: signed() },
         Control::Unreach { names: vec![name; 3] },
         Control::Interest { names: vec![name; 2] },

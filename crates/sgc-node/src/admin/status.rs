@@ -27,6 +27,8 @@ pub struct Status {
     pub links: Vec<LinkStatus>,
     /// The routers that the node looks for, and the state of each search.
     pub routers: Vec<RouterStatus>,
+    /// The address of this host from which packets to the IPv6 internet leave; null without a route there.
+    pub ipv6: Option<String>,
     /// Shares and uses, and the state of each.
     pub routes: Vec<RouteLine>,
     /// Alerts for an operator.
@@ -65,6 +67,12 @@ pub struct LinkStatus {
     pub remote: String,
     /// The URL that this node dialled; null if the peer dialled.
     pub url: Option<String>,
+    /// The address of this host from which its packets leave for the peer; null if the peer dialled, or there is no
+    /// route.
+    pub local: Option<String>,
+    /// The address and port from which this node comes, as the peer sees it: another than `local` behind a NAT. Null if
+    /// the peer dialled, or has not said it, as nodes of earlier versions do not.
+    pub observed: Option<String>,
     /// The key exchange, as TLS names it.
     pub kex: &'static str,
     /// The smoothed round-trip time, microseconds.

@@ -323,6 +323,9 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Frame { link, frame: Control::IdentityInUse { place }, .. } => {
                 self.kept_out(link, place)
             }
+            CoreEvent::Frame { link, frame: Control::ObservedAddress { place }, .. } => {
+                self.address_observed(link, place);
+            }
             CoreEvent::Frame { link, frame, room } => self.handle_frame(link, frame, room),
             CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
             CoreEvent::Malformed { link } => {

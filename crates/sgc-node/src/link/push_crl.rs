@@ -8,7 +8,7 @@ use sgc_transport::{
     CloseReason, DialError, Dialer, Link, LinkError, LinkOptions, LinkUrl, TransportMetrics,
 };
 use sgc_trust::Identity;
-use sgc_wire::{Control, Decode, Encode, Hello, UnixMillis};
+use sgc_wire::{Control, Decode, Encode, Hello, MINOR_VERSION, UnixMillis};
 
 /// Time for a router to greet and to answer a goodbye.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
@@ -61,7 +61,7 @@ async fn tell(link: &impl Link, list: Bytes) -> Result<Vec<Bytes>, LinkError> {
     // The incarnation differs from that of any run of a node. No decision depends on it.
     incarnation.copy_from_slice(&link.peer().node_id.0[..8]);
     let hello = Hello {
-        minor: 0,
+        minor: MINOR_VERSION,
         incarnation: u64::from_be_bytes(incarnation),
         transit: false,
         yields: true,

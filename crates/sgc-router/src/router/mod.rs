@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::Identity;
-use sgc_wire::{ClockWatch, Control, Hello, Name, NodeId, Now};
+use sgc_wire::{ClockWatch, Control, Hello, MINOR_VERSION, Name, NodeId, Now};
 
 use self::lists::ListAllowances;
 use self::sync::Syncs;
@@ -78,7 +78,7 @@ impl Router {
     /// Returns a router with only its local link.
     pub fn new(config: RouterConfig, now: Now) -> Self {
         let local = Hello {
-            minor: 0,
+            minor: MINOR_VERSION,
             incarnation: config.incarnation,
             transit: false,
             yields: false,
@@ -162,6 +162,8 @@ impl Router {
             Control::Clock { time } => self.handle_clock(link, time),
             // Its content is for the operator alone.
             Control::IdentityInUse { .. } => self.drop_frame(link, DropReason::Unknown { what: "identity" }),
+            // Its driver takes those that it expects.
+            Control::ObservedAddress { .. } => self.drop_frame(link, DropReason::Unknown { what: "address" }),
             Control::LaneOffer { .. }
             | Control::LaneAnswer { .. }
             | Control::LaneWanted { .. }
@@ -269,6 +271,11 @@ impl Router {
     /// Returns the results of the route searches.
     pub fn route_stats(&self) -> RouteStats {
         self.topology.route_stats()
+    }
+
+    /// Returns the minor version of the protocol with which the node of a link greeted; `None` before it did.
+    pub fn minor(&self, link: LinkId) -> Option<u16> {
+        Some(self.links.get(link)?.hello()?.minor)
     }
 
     /// Returns the cost of a link, microseconds of round trip, and whether it seems dead.

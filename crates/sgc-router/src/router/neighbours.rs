@@ -1,6 +1,6 @@
 //! Links that come and go, greetings, and the clocks of neighbours.
 
-use sgc_wire::{Control, Hello, UnixMillis};
+use sgc_wire::{Control, Hello, MINOR_VERSION, UnixMillis};
 
 use super::{Claim, Router};
 use crate::drops::DropReason;
@@ -25,7 +25,7 @@ impl Router {
         self.links.add(now, link, neighbour);
         self.names.link_up(link);
         let hello = Hello {
-            minor: 0,
+            minor: MINOR_VERSION,
             incarnation: self.config.incarnation,
             transit: self.config.transit,
             yields: self.claim == Claim::Yields,

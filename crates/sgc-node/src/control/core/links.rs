@@ -1,12 +1,13 @@
 //! Links that come and go, and their frames.
 
+use std::net::SocketAddr;
 use std::time::Instant;
 
 use sgc_ros::RosNetwork;
-use sgc_router::{LinkId, Neighbour};
+use sgc_router::{DropReason, LinkId, Neighbour};
 use sgc_transport::{AnyLink, CloseReason, Link, LinkUrl};
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Control, NodeId};
+use sgc_wire::{Control, MINOR_OBSERVED_ADDRESS, NodeId, Place};
 use tokio::sync::oneshot;
 use tracing::{debug, info, warn};
 
@@ -77,6 +78,9 @@ impl<N: RosNetwork> Core<N> {
         let now = now();
         for LinkMeasurement { link, rtt, is_silent } in self.links.look(at) {
             self.router.handle_link_quality(now, link, rtt, is_silent);
+            if self.router.minor(link) >= Some(MINOR_OBSERVED_ADDRESS) {
+                self.links.tell_address(link);
+            }
         }
         self.warn_of_owners_here();
         self.warn_of_misspelt(now.instant);
@@ -89,6 +93,16 @@ impl<N: RosNetwork> Core<N> {
         drop(room);
         if tells_time {
             self.compare_clocks(link);
+        }
+    }
+
+    /// Handles a peer's report of the address from which this node comes.
+    pub(super) fn address_observed(&mut self, link: LinkId, place: Place) {
+        let address = SocketAddr::from(place);
+        if self.links.observe_address(link, address) {
+            debug!(link = link.0, %address, "the peer sees this node at an address");
+        } else {
+            self.control_drops.count_from(&DropReason::Unknown { what: "address" }, link);
         }
     }
 

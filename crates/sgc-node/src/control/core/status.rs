@@ -1,6 +1,7 @@
 //! The node's status, as `sgc status` and the metrics show it.
 
 use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
 use sgc_ros::{RosNetwork, RouteStatus, Routes};
 use sgc_router::LinkId;
@@ -10,7 +11,12 @@ use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status
 use crate::control::parts::link_table::LinkEntry;
 use crate::data::stats::CountDrops;
 use crate::drops::NodeDrop;
+use crate::link::roaming::source_towards;
 use crate::metrics::readings::{LinkReadings, ROUTES_MAX, Readings, RouteReading};
+
+/// An address of the IPv6 internet, to which nothing is sent: the first of the global unicast addresses (RFC 4291, 2.4).
+const IPV6_INTERNET: SocketAddr =
+    SocketAddr::new(IpAddr::V6(Ipv6Addr::new(0x2000, 0, 0, 0, 0, 0, 0, 1)), 443);
 
 impl<N: RosNetwork> Core<N> {
     /// Returns the node's status.
@@ -23,6 +29,7 @@ impl<N: RosNetwork> Core<N> {
             uptime_s: self.started.elapsed().as_secs(),
             links: links.collect(),
             routers: self.board.snapshot(),
+            ipv6: source_towards(IPV6_INTERNET).map(|ip| ip.to_string()),
             routes: self.routes.iter().flat_map(Routes::status).map(|route| self.route_line(route)).collect(),
             alerts: self.alerts(),
             problems: self.problems(),
@@ -103,6 +110,8 @@ impl<N: RosNetwork> Core<N> {
             peer_until: entry.peer().not_after.to_string(),
             remote: entry.remote().to_string(),
             url: entry.url().map(str::to_owned),
+            local: entry.url().and_then(|_| source_towards(entry.remote())).map(|ip| ip.to_string()),
+            observed: entry.observed().map(|address| address.to_string()),
             kex: stats.key_exchange.label(),
             rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
             cost,

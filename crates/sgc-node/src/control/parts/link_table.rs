@@ -6,7 +6,7 @@
 //! time out.
 
 use std::collections::{BTreeMap, HashMap};
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -36,6 +36,10 @@ pub(crate) struct LinkEntry {
     /// Reason, if this node closed it.
     closed_for: Option<String>,
     keep_alive: KeepAlive,
+    /// The address that the peer was told to come from.
+    told: Option<SocketAddr>,
+    /// The address from which this node comes, as the peer sees it.
+    observed: Option<SocketAddr>,
 }
 
 /// All links that are up.
@@ -87,8 +91,9 @@ impl LinkTable {
         self.next += 1;
         let policy = self.policies.for_peer(&link.peer().node_id);
         let keep_alive = KeepAlive::new(now, policy, link.stats().received_bytes, link.remote());
-        let flows = HashMap::new();
-        self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, keep_alive });
+        let (flows, closed_for, told, observed) = (HashMap::new(), None, None, None);
+        self.links
+            .insert(id, LinkEntry { link, url, control, flows, closed_for, keep_alive, told, observed });
         self.look_due.get_or_insert(now + LOOK_EVERY);
         id
     }
@@ -156,6 +161,24 @@ impl LinkTable {
         looks.collect()
     }
 
+    /// Tells the peer that dialled a link from which address it comes, once for each address.
+    pub(crate) fn tell_address(&mut self, id: LinkId) {
+        let Some(entry) = self.links.get_mut(&id).filter(|entry| entry.url.is_none()) else { return };
+        let remote = entry.link.remote();
+        // What a full queue does not take is told at the next look.
+        if entry.told != Some(remote) && entry.control.send(Control::ObservedAddress { place: remote.into() })
+        {
+            entry.told = Some(remote);
+        }
+    }
+
+    /// Notes from which address this node comes, as the peer sees it. Returns `false` if the peer is none that this node
+    /// dialled, or the address is none of a host.
+    pub(crate) fn observe_address(&mut self, id: LinkId, address: SocketAddr) -> bool {
+        let entry = self.links.get_mut(&id).filter(|entry| entry.url.is_some() && is_of_host(&address));
+        entry.map(|entry| entry.observed = Some(address)).is_some()
+    }
+
     /// Returns the time of the next look.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.look_due
@@ -209,6 +232,13 @@ impl LinkTable {
     }
 }
 
+/// Returns `true` for an address from which the packets of one host can come.
+fn is_of_host(address: &SocketAddr) -> bool {
+    let ip = address.ip();
+    let is_broadcast = matches!(ip, IpAddr::V4(v4) if v4.is_broadcast());
+    address.port() != 0 && !ip.is_unspecified() && !ip.is_multicast() && !is_broadcast
+}
+
 impl LinkEntry {
     pub(crate) fn peer(&self) -> &VerifiedPeer {
         self.link.peer()
@@ -221,6 +251,11 @@ impl LinkEntry {
     /// Returns the URL that this node dialled; `None` if the peer dialled.
     pub(crate) fn url(&self) -> Option<&str> {
         self.url.as_deref()
+    }
+
+    /// Returns the address from which this node comes, as the peer that it dialled says.
+    pub(crate) fn observed(&self) -> Option<SocketAddr> {
+        self.observed
     }
 
     /// Returns the measurements of the link, with the bytes of its lanes.
@@ -369,6 +404,44 @@ mod tests {
         assert_eq!(bench.table.remove(closed).unwrap().closed_for.as_deref(), Some("revoked here"));
         assert_eq!(bench.table.remove(lost).unwrap().closed_for, None);
         assert!(bench.far[0].recv_control().await.is_err(), "the far end hears of it");
+    }
+
+    #[tokio::test]
+    async fn peer_that_dialled_is_told_each_of_its_addresses_once() {
+        let mut bench = Bench::new();
+        let (link, mut frames) = bench.add(Instant::now()).await;
+        bench.table.tell_address(link);
+        assert!(frames.try_recv().is_err(), "this node dialled");
+        let entry = bench.table.links.get_mut(&link).unwrap();
+        entry.url = None;
+        let remote = entry.remote();
+        bench.table.tell_address(link);
+        bench.table.tell_address(link);
+        let is_told = |told: Outgoing| match told {
+            Outgoing::Frame(Control::ObservedAddress { place }) => SocketAddr::from(place) == remote,
+            _ => false,
+        };
+        assert!(is_told(frames.try_recv().unwrap()) && frames.try_recv().is_err());
+        // The peer came from elsewhere before.
+        bench.table.links.get_mut(&link).unwrap().told = Some("192.0.2.1:7".parse().unwrap());
+        bench.table.tell_address(link);
+        assert!(is_told(frames.try_recv().unwrap()));
+    }
+
+    #[tokio::test]
+    async fn address_of_a_host_is_taken_from_dialled_peers_alone() {
+        let mut bench = Bench::new();
+        let (link, _frames) = bench.add(Instant::now()).await;
+        let mut take = |address: &str| bench.table.observe_address(link, address.parse().unwrap());
+        for none in
+            ["0.0.0.0:1", "203.0.113.7:0", "255.255.255.255:1", "224.0.0.1:1", "[::]:1", "[ff02::1]:1"]
+        {
+            assert!(!take(none), "{none}");
+        }
+        assert!(take("203.0.113.7:4000") && take("[2001:db8::7]:4001"));
+        assert_eq!(bench.table.get(link).unwrap().observed(), Some("[2001:db8::7]:4001".parse().unwrap()));
+        bench.table.links.get_mut(&link).unwrap().url = None;
+        assert!(!bench.table.observe_address(link, "203.0.113.7:4000".parse().unwrap()));
     }
 
     #[tokio::test]
