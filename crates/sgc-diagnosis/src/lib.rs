@@ -2,7 +2,7 @@
 //!
 //! [`diagnose`] follows the path of a topic in a node's graph up to the first fault, and finds facts without words,
 //! which `words` renders. [`refusals`] explains counters, [`status`] a node's status, [`fleet`] those of all
-//! nodes, [`rights`] the members that rules permit, and [`check`] a configuration. Of these, only [`ask`] talks to nodes. The crate parses no arguments, prints nothing and knows no exit codes; `sgc`
+//! nodes, [`rights`] the members that rules permit, [`netcheck`] the network of a node, and [`check`] a configuration. Of these, only [`ask`] talks to nodes. The crate parses no arguments, prints nothing and knows no exit codes; `sgc`
 //! does.
 
 pub mod ask;
@@ -13,6 +13,7 @@ mod finding;
 pub mod fleet;
 pub mod names;
 mod near;
+pub mod netcheck;
 pub mod refusals;
 pub mod rights;
 pub mod status;

@@ -4,6 +4,7 @@
 //! older and newer nodes.
 
 use std::collections::BTreeMap;
+use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 
 use serde::Deserialize;
@@ -20,13 +21,15 @@ use crate::refusals;
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub struct Status {
-    node: String,
+    pub(crate) node: String,
     version: String,
     uptime_s: u64,
     /// Links to other nodes.
     pub links: Vec<Link>,
     /// Routers that the node dials or searches.
     pub routers: Vec<Router>,
+    /// Address of the host from which packets to the IPv6 internet leave.
+    pub(crate) ipv6: Option<IpAddr>,
     /// Shares and uses.
     pub routes: Vec<Route>,
     /// States that need an operator.
@@ -100,7 +103,11 @@ pub struct Link {
     pub peer: String,
     /// Address of the peer.
     pub remote: String,
-    url: Option<String>,
+    pub(crate) url: Option<String>,
+    /// Address of the host from which packets to the peer leave.
+    pub(crate) local: Option<IpAddr>,
+    /// Address from which the node comes, as the peer sees it.
+    pub(crate) observed: Option<SocketAddr>,
     /// Round trip, in microseconds.
     pub rtt_us: u64,
     cost: u32,
@@ -119,8 +126,8 @@ pub struct Router {
     /// The router as configured.
     pub router: String,
     found_by: String,
-    at: Option<String>,
-    state: String,
+    pub(crate) at: Option<String>,
+    pub(crate) state: String,
     why_not_first: Option<String>,
     /// Failures since the last success.
     pub failures: u32,

@@ -27,6 +27,7 @@ mod log_filter;
 mod memory;
 mod moved;
 mod name;
+mod netcheck;
 mod node;
 mod output;
 mod pages;
@@ -84,6 +85,7 @@ enum Command {
     Router(run::RouterArgs),
     Check(check::CheckArgs),
     Status(status::StatusArgs),
+    Netcheck(netcheck::NetcheckArgs),
     Dashboard(dashboard::DashboardArgs),
     Topic(topic::TopicArgs),
     Service(service::ServiceArgs),
@@ -157,6 +159,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Topic(args) => return topic::topic(&args),
         Command::Service(args) => return service::service(&args),
         Command::Status(args) => status::status(&args),
+        Command::Netcheck(args) => netcheck::netcheck(&args),
         Command::Dashboard(args) => dashboard::dashboard(&args),
         Command::Reload(args) => return reload::reload(&args),
         Command::Audit(args) => audit::audit(&args),

@@ -1,7 +1,9 @@
 //! The program and the applications of others, rather than nodes and networks in this process.
 
+use std::net::SocketAddr;
 use std::thread::sleep;
 
+use serde_json::{Value, json};
 use sgc_testkit::netsim::Namespace;
 
 use crate::lab::{Lab, Lan, Nat, RANGES, schemes};
@@ -82,5 +84,55 @@ fn programs_of_others_lose_nothing_when_a_nat_forgets() {
             assert_eq!(summary[what], 0, "{scheme}: {summary}");
         }
         assert_eq!(summary["received"].as_u64(), Some(last - first + 1), "{scheme}: {summary}");
+    }
+}
+
+/// Two routers tell the robot from which address it comes, and again after its NAT forgot it.
+#[test]
+fn a_robot_learns_its_nat_from_its_routers() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let second = "10.10.0.2";
+    let nats = [(Nat::FullCone, "endpoint_independent"), (Nat::RandomPort(RANGES[0]), "endpoint_dependent")];
+    for (nat, mapping) in nats {
+        let lab = Lab::new(Lan::Cable, nat);
+        lab.cloud.ip(&["address", "add", &format!("{second}/32"), "dev", "lo"]).unwrap();
+        let urls = [lab.url("quic"), format!("quic://{second}:7447")];
+        for (router, url) in ["cloud", "cloud-2"].into_iter().zip(&urls) {
+            lab.enroll(router, true);
+            lab.write_config(router, &[], &format!("[router]\nlisten = [\"{url}\"]\n"));
+        }
+        lab.enroll("robot", false);
+        lab.write_config("robot", &urls.each_ref().map(String::as_str), "[ros]\nstatic_peers = []\n");
+        let _routers = ["cloud", "cloud-2"].map(|router| run(&lab, &lab.cloud, router));
+        let _robot = run(&lab, &lab.robot, "robot");
+        let netcheck = |args: &[&str]| {
+            let mut command = support::sgc(Some(&lab.robot), lab.dir());
+            let output =
+                command.args(["netcheck", "-c"]).arg(lab.path("robot.toml")).args(args).output().unwrap();
+            assert!(output.status.success(), "{output:?}");
+            String::from_utf8(output.stdout).unwrap()
+        };
+        let found = || serde_json::from_str::<Value>(&netcheck(&["--json"])).unwrap();
+        let seen = || {
+            let links = found()["links"].as_array().cloned().unwrap();
+            let observed = links.iter().filter_map(|link| link["observed"].as_str());
+            observed.map(|address| address.parse().unwrap()).collect::<Vec<SocketAddr>>()
+        };
+        eventually("both routers have told", || seen().len() == 2);
+        let found = found();
+        assert_eq!((&found["udp"], &found["nat"]), (&json!("passes"), &json!("present")), "{found}");
+        assert_eq!(found["mapping"], mapping, "{found}");
+        let said = netcheck(&[]);
+        assert!(said.contains("NAT: 10.1.0.2 is seen as 10.10.1.2."), "{said}");
+        if let Nat::RandomPort(_) = nat {
+            assert!(seen().iter().all(|address| (20_000..30_000).contains(&address.port())), "{found}");
+            lab.rebind(RANGES[1]);
+            eventually("the new ports are told", || {
+                seen().iter().all(|address| (30_000..40_000).contains(&address.port()))
+            });
+        }
     }
 }
