@@ -90,11 +90,19 @@ pub fn ask_nodes(
         parts.push(&[]);
     }
     for nodes in parts {
-        let request = ReportRequest { nodes: nodes.to_vec(), interface: interface.map(str::to_owned) };
+        let interface = interface.map(str::to_owned);
+        let request = ReportRequest { nodes: nodes.to_vec(), interface, ping: false };
         let text = ask(socket, &AdminRequest::Report(request), ANSWER_MAX)?;
         answers.extend(answer::<Vec<ReportAnswer>>(socket, &text)?);
     }
     Ok(answers)
+}
+
+/// Asks a node of the fleet for nothing but an answer, by the node at this socket.
+pub fn ping(socket: &Path, node: &str) -> Result<ReportAnswer, DiagnosisError> {
+    let request = ReportRequest { nodes: vec![node.to_owned()], ping: true, ..ReportRequest::default() };
+    let text = ask(socket, &AdminRequest::Report(request), ANSWER_MAX)?;
+    Ok(answer::<Vec<ReportAnswer>>(socket, &text)?.pop().unwrap_or_default())
 }
 
 /// The members of a fleet.

@@ -13,9 +13,9 @@ use sgc_trust::{EnrollRequest, Fleet, KeyRequest, MessageKey, ShareToken, Suite,
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Challenge, Class,
     Consumer, Control, Credentials, DescribedType, Encode, GrantContent, Hello, JoinBody, MessageHead,
-    MessageKind, Metadata, Name, OperationAnswer, PayloadEncoding, PayloadForm, Qos, Recover, RefuseReason,
-    RejectReason, Report, ReportQuestion, Request, Role, RosNode, SecretBytes, SecretGeneration, SignedBody,
-    SinkId, SourceId, SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
+    MessageKind, Metadata, Name, OperationAnswer, PayloadEncoding, PayloadForm, Place, Qos, Recover,
+    RefuseReason, RejectReason, Report, ReportQuestion, Request, Role, RosNode, SecretBytes,
+    SecretGeneration, SignedBody, SinkId, SourceId, SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
 };
 
 /// The time of the targets.
@@ -105,6 +105,7 @@ fn control() -> Vec<Vec<u8>> {
         Control::Reject { name, sink, reason: RejectReason::Limit },
         Control::Recover(Recover { name, sink, source, from: 1, to: 9 }),
         Control::Goodbye,
+        Control::ObservedAddress { place: Place { ip: [8; 16], port: 9 } },
     ];
     frames.map(|f| f.to_vec()).into()
 }
@@ -189,6 +190,7 @@ fn bodies() -> Vec<Vec<u8>> {
     all.push((8, ReportQuestion::Interface("/camera".into()).to_vec()));
     let document = Bytes::from_static(b"{\"version\":\"1\"}");
     all.push((9, Report { encoding: PayloadEncoding::Plain, document }.to_vec()));
+    all.push((8, ReportQuestion::Ping.to_vec()));
     all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
 }
 

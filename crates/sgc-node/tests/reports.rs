@@ -31,7 +31,7 @@ fn keeper(lab: &Lab) -> Node {
 
 fn ask(node: &Node, nodes: &[&str], interface: Option<&str>) -> Vec<ReportAnswer> {
     let nodes = nodes.iter().map(|node| (*node).to_owned()).collect();
-    let request = ReportRequest { nodes, interface: interface.map(str::to_owned) };
+    let request = ReportRequest { nodes, interface: interface.map(str::to_owned), ping: false };
     let mut answer = node.ask(&AdminRequest::Report(request));
     serde_json::from_value(answer["ok"].take()).unwrap()
 }
@@ -50,6 +50,12 @@ fn report_of(asker: &Node, node: &str) -> NodeReport {
 fn graph_of(asker: &Node, node: &str, interface: &str) -> Graph {
     let text = ask(asker, &[node], Some(interface)).remove(0).graph.unwrap();
     serde_json::from_str(&text).unwrap()
+}
+
+fn ping(asker: &Node, node: &str) -> ReportAnswer {
+    let request = ReportRequest { nodes: vec![node.to_owned()], ping: true, ..ReportRequest::default() };
+    let mut answer = asker.ask(&AdminRequest::Report(request));
+    serde_json::from_value::<Vec<_>>(answer["ok"].take()).unwrap().remove(0)
 }
 
 fn error_of(asker: &Node, node: &str) -> String {
@@ -228,4 +234,27 @@ fn node_that_is_no_observer_learns_nothing_and_a_reload_decides_anew() {
         let error = ask(&guest, &[], None).remove(0).error;
         error.is_some_and(|error| error.starts_with(refused))
     });
+}
+
+#[test]
+fn observer_pings_nodes_and_learns_the_path() {
+    let lab = observed(&["robot"]);
+    let (_cloud, _keeper) = (lab.cloud(), keeper(&lab));
+    let robot = lab.start("robot", |_| {});
+    let desk = lab.start("desk", |_| {});
+    wait("an answer", || ping(&desk, "robot").pong.is_some());
+    let answer = ping(&desk, "robot");
+    assert_eq!(answer.pong.map(|pong| pong.version).as_deref(), Some(env!("CARGO_PKG_VERSION")));
+    assert!((1..10_000_000).contains(&answer.answered_us) && answer.error.is_none());
+    let path = answer.path.unwrap();
+    assert!(!path.direct && path.via == lab.url(), "{path:?}");
+    let router = ping(&desk, "cloud").path.unwrap();
+    assert!(router.direct && router.via == lab.url(), "{router:?}");
+    let own = ping(&desk, "desk");
+    assert!(own.pong.is_some() && own.path.is_none());
+    // A node that is no observer gets no answer, and neither does one that asks a node that is off.
+    let refused = |error: String| error.contains("observer");
+    wait("a refusal", || ping(&robot, "desk").error.is_some_and(refused));
+    robot.kill();
+    wait("it is gone", || ping(&desk, "robot").error.is_some());
 }

@@ -22,6 +22,8 @@ pub enum ReportQuestion {
     Node,
     /// Everything that explains whether this topic, service or action flows; by its name at that node.
     Interface(String),
+    /// Nothing but an answer, so that its round trip can be measured.
+    Ping,
 }
 
 /// The answer to a [`ReportQuestion`].
@@ -41,6 +43,7 @@ impl Encode for ReportQuestion {
                 w.u8(1);
                 w.str(name);
             }
+            Self::Ping => w.u8(2),
         }
     }
 }
@@ -50,6 +53,7 @@ impl Decode for ReportQuestion {
         match r.u8()? {
             0 => Ok(Self::Node),
             1 => Ok(Self::Interface(r.str("interface", REPORT_INTERFACE_BYTES_MAX)?)),
+            2 => Ok(Self::Ping),
             v => Err(DecodeError::value("question for a report", v.into())),
         }
     }
@@ -88,6 +92,7 @@ mod tests {
         for (question, bytes) in [
             (ReportQuestion::Node, &[0][..]),
             (ReportQuestion::Interface("/a".into()), &[1, 0, 0, 0, 2, b'/', b'a']),
+            (ReportQuestion::Ping, &[2]),
         ] {
             assert_eq!(question.to_vec(), bytes);
             assert_eq!(ReportQuestion::from_slice(bytes), Ok(question));
@@ -104,7 +109,7 @@ mod tests {
         assert!(longest.len() <= ASK_BYTES_MAX && ReportQuestion::from_slice(&longest).is_ok());
         let longer = ReportQuestion::from_slice(&question(REPORT_INTERFACE_BYTES_MAX + 1));
         assert!(matches!(longer, Err(DecodeError::TooLong { .. })), "{longer:?}");
-        assert!(ReportQuestion::from_slice(&[2]).is_err() && ReportQuestion::from_slice(&[0, 0]).is_err());
+        assert!(ReportQuestion::from_slice(&[3]).is_err() && ReportQuestion::from_slice(&[0, 0]).is_err());
         assert!(Report::from_slice(&[2, 0, 0, 0, 0]).is_err());
         let report = |bytes| Report { encoding: PayloadEncoding::Plain, document: vec![0; bytes].into() };
         let longest = GrantContent::Report(report(REPORT_PACKED_BYTES_MAX)).to_vec();

@@ -31,6 +31,7 @@ mod netcheck;
 mod node;
 mod output;
 mod pages;
+mod ping;
 mod policy;
 mod reload;
 mod run;
@@ -86,6 +87,7 @@ enum Command {
     Check(check::CheckArgs),
     Status(status::StatusArgs),
     Netcheck(netcheck::NetcheckArgs),
+    Ping(ping::PingArgs),
     Dashboard(dashboard::DashboardArgs),
     Topic(topic::TopicArgs),
     Service(service::ServiceArgs),
@@ -160,6 +162,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Service(args) => return service::service(&args),
         Command::Status(args) => status::status(&args),
         Command::Netcheck(args) => netcheck::netcheck(&args),
+        Command::Ping(args) => return ping::ping(&args),
         Command::Dashboard(args) => dashboard::dashboard(&args),
         Command::Reload(args) => return reload::reload(&args),
         Command::Audit(args) => audit::audit(&args),

@@ -2,7 +2,7 @@
 
 use std::fmt::Display;
 
-pub(crate) use sgc_process::output::{bytes, clean, columns, diagnostic, raw};
+pub(crate) use sgc_process::output::{bytes, clean, columns, diagnostic, millis, raw};
 
 use serde::Serialize;
 use sgc_process::ProcessError;

@@ -39,11 +39,11 @@ pub use self::socket::{
 };
 
 use crate::admin::graph::Side;
-use crate::admin::report::NodeReport;
+use crate::admin::report::{NodeReport, Pong, ReportPath};
 use crate::admin::shell::{CallRequest, PublishRequest};
 use crate::clock::now;
 use crate::control::event::CoreEvent;
-use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryTarget};
+use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryReport, InquiryTarget};
 use crate::control::settings::reload::Reloader;
 use crate::data::tap::{Tap, TapMessage, TapRequest};
 use crate::gateway::Gateway;
@@ -132,6 +132,9 @@ pub struct ReportRequest {
     /// A topic, service or action by its name at these nodes, for their graphs of it; without one, they are asked
     /// for a [`NodeReport`].
     pub interface: Option<String>,
+    /// Whether they are asked for nothing but an answer ([`Pong`]), to measure its round trip.
+    #[serde(default)]
+    pub ping: bool,
 }
 
 /// The answer of a node of a [`ReportRequest`]: a report, a graph, or an error.
@@ -146,6 +149,13 @@ pub struct ReportAnswer {
     pub report: Option<NodeReport>,
     /// Its [`Graph`](crate::admin::graph::Graph) of the interface, as JSON that is not verified.
     pub graph: Option<String>,
+    /// Its answer to a ping.
+    pub pong: Option<Pong>,
+    /// The time from the question to the answer, microseconds. The first question to a node takes longer, because its
+    /// name is looked up.
+    pub answered_us: u64,
+    /// The path over which it answered; null if there is no answer, or the node is this one.
+    pub path: Option<ReportPath>,
     /// The reason why there is no answer.
     pub error: Option<String>,
     /// The remedy; empty if there is none to name.
@@ -638,6 +648,7 @@ async fn report(
         return Err(format!("at most {REPORT_NODES_MAX} nodes are asked at one time"));
     }
     let question = match request.interface {
+        _ if request.ping => ReportQuestion::Ping,
         None => ReportQuestion::Node,
         Some(name) if name.len() > REPORT_INTERFACE_BYTES_MAX => {
             return Err(format!("a name has at most {REPORT_INTERFACE_BYTES_MAX} bytes"));
@@ -657,39 +668,44 @@ async fn report(
     for (node, at) in targets {
         let (reply, answer) = oneshot::channel();
         let event = CoreEvent::Inquire { at, question: question.clone(), reply };
+        let begun = Instant::now();
         events.send(event).await.map_err(|_| stopping())?;
-        asked.spawn(async move { (node, answer.await) });
+        asked.spawn(async move { (node, answer.await, begun.elapsed()) });
     }
     let mut answers = Vec::new();
-    while let Some(Ok((node, document))) = asked.join_next().await {
-        let document = document.map_err(|_| stopping())?;
-        answers.push(report_answer(node, &question, document));
+    while let Some(Ok((node, answer, took))) = asked.join_next().await {
+        let answered_us = took.as_micros().try_into().unwrap_or(u64::MAX);
+        let answer = answer.map_err(|_| stopping())?;
+        answers.push(ReportAnswer { answered_us, ..report_answer(node, &question, answer) });
     }
     answers.sort_by(|a, b| a.node.cmp(&b.node));
     Ok(answers)
 }
 
-fn report_answer(node: String, question: &ReportQuestion, document: InquiryAnswer) -> ReportAnswer {
-    let unreadable = InquiryError::Unreadable;
-    let mut answer = ReportAnswer { node, at_ms: now().unix.0, ..ReportAnswer::default() };
-    let error = match (document, question) {
-        (Ok(document), ReportQuestion::Node) => match NodeReport::from_json(&document) {
-            Ok(report) => {
-                answer.report = Some(report);
-                return answer;
+fn report_answer(node: String, question: &ReportQuestion, answer: InquiryAnswer) -> ReportAnswer {
+    let mut shown = ReportAnswer { node, at_ms: now().unix.0, ..ReportAnswer::default() };
+    let read = answer.and_then(|InquiryReport { document, path }| {
+        shown.path = path;
+        let is_read = match question {
+            ReportQuestion::Node => {
+                shown.report = NodeReport::from_json(&document).ok();
+                shown.report.is_some()
             }
-            Err(_) => unreadable,
-        },
-        (Ok(document), ReportQuestion::Interface(_)) => match String::from_utf8(document.into()) {
-            Ok(graph) => {
-                answer.graph = Some(graph);
-                return answer;
+            ReportQuestion::Interface(_) => {
+                shown.graph = String::from_utf8(document.into()).ok();
+                shown.graph.is_some()
             }
-            Err(_) => unreadable,
-        },
-        (Err(error), _) => error,
-    };
-    ReportAnswer { error: Some(error.to_string()), fix: error.fix().to_owned(), ..answer }
+            ReportQuestion::Ping => {
+                shown.pong = Pong::from_json(&document).ok();
+                shown.pong.is_some()
+            }
+        };
+        if is_read { Ok(()) } else { Err(InquiryError::Unreadable) }
+    });
+    match read {
+        Ok(()) => shown,
+        Err(error) => ReportAnswer { error: Some(error.to_string()), fix: error.fix().to_owned(), ..shown },
+    }
 }
 
 fn parse_name(text: &str) -> Option<Name> {
@@ -735,6 +751,12 @@ mod tests {
             AdminRequest::Report(ReportRequest {
                 nodes: vec!["arm-1".into()],
                 interface: Some("/a b".into()),
+                ping: false,
+            }),
+            AdminRequest::Report(ReportRequest {
+                nodes: vec!["arm-1".into()],
+                ping: true,
+                ..Default::default()
             }),
             AdminRequest::Call(CallRequest { request: "{\"a\":\n1}".into(), ..Default::default() }),
             AdminRequest::Operate {

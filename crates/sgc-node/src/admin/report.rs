@@ -283,6 +283,35 @@ impl ReportMember {
     }
 }
 
+/// The path over which a node answered.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ReportPath {
+    /// The next node: its name if that is known here, else the URL at which it was dialled, else its id.
+    pub via: String,
+    /// `true` if that is the node itself.
+    pub direct: bool,
+    /// The round-trip time of the path, microseconds, as routing adds up that of its links.
+    pub path_us: u64,
+}
+
+/// The answer to a ping.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Pong {
+    /// The version of the program.
+    pub version: String,
+}
+
+impl Pong {
+    /// Reads the document of another node. Its text is cut to its bound.
+    pub(crate) fn from_json(document: &[u8]) -> Result<Self, serde_json::Error> {
+        let mut pong: Self = serde_json::from_slice(document)?;
+        cut(&mut pong.version);
+        Ok(pong)
+    }
+}
+
 impl NodeReport {
     /// Reads the document of another node. Its texts and lists are cut to their bounds.
     pub(crate) fn from_json(document: &[u8]) -> Result<Self, serde_json::Error> {

@@ -12,13 +12,13 @@ use tracing::warn;
 
 use super::Core;
 use crate::admin::report::{
-    NodeReport, REPORT_FAULTS_MAX, REPORT_LINKS_MAX, REPORT_ROUTERS_MAX, REPORT_TOPICS_MAX, ReportEvent,
-    ReportLink, ReportRights, ReportRouter, ReportTopic, keep_interface,
+    NodeReport, Pong, REPORT_FAULTS_MAX, REPORT_LINKS_MAX, REPORT_ROUTERS_MAX, REPORT_TOPICS_MAX,
+    ReportEvent, ReportLink, ReportPath, ReportRights, ReportRouter, ReportTopic, keep_interface,
 };
 use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::fleet::authority::Authority;
-use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryTarget};
+use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryReport, InquiryTarget};
 use crate::control::parts::link_table::LinkEntry;
 use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
@@ -58,6 +58,10 @@ impl<N: RosNetwork> Core<N> {
             }
             // A later version may know further questions.
             Err(_) => Err(RefuseReason::RoleNotOffered),
+            // It waits for no document of others.
+            Ok(question @ ReportQuestion::Ping) => {
+                pack_report(&self.document_job(&question)()).ok_or(RefuseReason::Limit)
+            }
             Ok(question) => match self.reports.ask(Instant::now(), peer, sink, question) {
                 Some(report) => Ok(report),
                 None => return self.make_next_report(),
@@ -123,6 +127,10 @@ impl<N: RosNetwork> Core<N> {
                     keep_interface(&mut graph, &interface);
                     serde_json::to_string(&graph).unwrap_or_default().into()
                 })
+            }
+            ReportQuestion::Ping => {
+                let pong = Pong { version: env!("CARGO_PKG_VERSION").to_owned() };
+                Box::new(move || serde_json::to_string(&pong).unwrap_or_default().into())
             }
         }
     }
@@ -237,7 +245,9 @@ impl<N: RosNetwork> Core<N> {
         let node = match node {
             _ if is_own => {
                 let document = self.document_job(&question);
-                tokio::task::spawn_blocking(move || reply.send(Ok(document())));
+                tokio::task::spawn_blocking(move || {
+                    reply.send(Ok(InquiryReport { document: document(), path: None }))
+                });
                 return;
             }
             Err(why) => {
@@ -252,8 +262,14 @@ impl<N: RosNetwork> Core<N> {
 
     /// Takes a report of another node.
     pub(super) fn take_report(&mut self, name: Name, report: &Report) {
+        let path = self.path_to_owner(&name).map(|PathToOwner { via, is_direct, cost_us }| {
+            let mut dialled = self.links.iter().filter(|(_, link)| link.peer().node_id == via);
+            let url = dialled.find_map(|(_, link)| link.url().map(str::to_owned));
+            let via = self.names.get(&via).or(url).unwrap_or_else(|| via.short());
+            ReportPath { via, direct: is_direct, path_us: cost_us }
+        });
         let document = unpack_report(report).map_err(|_| InquiryError::Unreadable);
-        if self.inquiries.end(name, document) {
+        if self.inquiries.end(name, document.map(|document| InquiryReport { document, path })) {
             self.endpoint.leave(now(), &name);
             self.next_inquiry();
         }

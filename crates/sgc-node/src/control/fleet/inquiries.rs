@@ -10,6 +10,8 @@ use sgc_trust::NodeName;
 use sgc_wire::{Name, NodeId, RefuseReason, ReportQuestion};
 use tokio::sync::oneshot;
 
+use crate::admin::report::ReportPath;
+
 /// Most nodes that are asked at one time.
 const ASKED_MAX: usize = 128;
 /// Most questions that are asked or wait.
@@ -75,8 +77,17 @@ impl InquiryError {
     }
 }
 
-/// The document of a report, JSON that is not verified; or the reason why there is none.
-pub(crate) type InquiryAnswer = Result<Bytes, InquiryError>;
+/// The answer of a node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct InquiryReport {
+    /// The document of the report, JSON that is not verified.
+    pub(crate) document: Bytes,
+    /// The path to the node; `None` if it is this one.
+    pub(crate) path: Option<ReportPath>,
+}
+
+/// The answer, or the reason why there is none.
+pub(crate) type InquiryAnswer = Result<InquiryReport, InquiryError>;
 
 /// The node that a user asks.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -258,9 +269,10 @@ mod tests {
         let mut of_another_user = push(&mut inquiries, now, ARM, ReportQuestion::Node);
         assert_eq!(begin(&mut inquiries, now), [ARM, DESK]);
         assert!(!inquiries.end(Name([9; 32]), Err(InquiryError::Silent)), "of another name");
-        assert!(inquiries.end(name(ARM), Ok(Bytes::from_static(b"{}"))));
+        let answer = Ok(InquiryReport { document: Bytes::from_static(b"{}"), path: None });
+        assert!(inquiries.end(name(ARM), answer.clone()));
         for replied in [&mut first, &mut of_another_user] {
-            assert_eq!(replied.try_recv(), Ok(Ok(Bytes::from_static(b"{}"))));
+            assert_eq!(replied.try_recv(), Ok(answer.clone()));
         }
         assert_eq!(begin(&mut inquiries, now), [ARM]);
         assert!(inquiries.refused(name(ARM), RefusedBy::Owner(RefuseReason::NotPermitted)));
