@@ -47,7 +47,9 @@ impl Figure {
             Self::Resident => (8 * 1024, 10),
             Self::Anonymous => (4 * 1024, 10),
             Self::Descriptors => (8, 0),
-            Self::Threads => (3, 0),
+            // Idle threads for blocking work stay for 10 s. How many there are follows how much came together, such as
+            // the endpoints that a node creates after its start.
+            Self::Threads => (8, 0),
             // A reason of drops gets its line when it happens first.
             Self::Series => (12, 5),
             // Follows the faults, which are random.
