@@ -4,8 +4,10 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use clap::Args;
+use serde::Serialize;
 use sgc_diagnosis::fleet::ping as ask;
 use sgc_node::admin::ReportAnswer;
+use sgc_node::admin::report::ReportPath;
 use sgc_process::style::Line;
 use sgc_trust::NodeName;
 
@@ -49,7 +51,7 @@ pub(crate) fn ping(args: &PingArgs) -> Result<ExitCode, CliError> {
             answered.push(answer.answered_us);
         }
         if args.json {
-            output::json(&answer)?;
+            output::json(&AnswerJson::of(&args.at, &answer))?;
         } else {
             lines(&args.at, &answer).into_iter().try_for_each(|line| line.cleaned().print())?;
         }
@@ -61,6 +63,34 @@ pub(crate) fn ping(args: &PingArgs) -> Result<ExitCode, CliError> {
         output::line(summary(args.count, &answered))?;
     }
     Ok(if answered.is_empty() { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })
+}
+
+/// An answer as JSON.
+#[derive(Debug, Serialize)]
+struct AnswerJson<'a> {
+    node: &'a str,
+    /// Time from question to answer; null if none came.
+    answered_us: Option<u64>,
+    /// Version of the other program.
+    version: Option<&'a str>,
+    /// Path over which it answered; null for the node here.
+    path: Option<&'a ReportPath>,
+    error: Option<&'a str>,
+    fix: &'a str,
+}
+
+impl<'a> AnswerJson<'a> {
+    fn of(node: &'a str, answer: &'a ReportAnswer) -> Self {
+        let ReportAnswer { pong, answered_us, path, error, fix, .. } = answer;
+        Self {
+            node,
+            answered_us: error.is_none().then_some(*answered_us),
+            version: pong.as_ref().map(|pong| pong.version.as_str()),
+            path: path.as_ref(),
+            error: error.as_deref(),
+            fix,
+        }
+    }
 }
 
 fn lines(node: &str, answer: &ReportAnswer) -> Vec<Line> {
@@ -90,7 +120,7 @@ fn summary(asked: u64, answered: &[u64]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use sgc_node::admin::report::ReportPath;
+    use serde_json::json;
 
     use super::*;
 
@@ -105,6 +135,12 @@ mod tests {
         };
         assert_eq!(said(&over(false)), ["robot answered after 43 ms, relayed by cloud (42 ms by its links)"]);
         assert_eq!(said(&over(true)), ["robot answered after 43 ms, directly (42 ms by its links)"]);
+        let answer = over(true);
+        let path = json!({ "via": "cloud", "direct": true, "path_us": 42_000 });
+        let told = json!({
+            "node": "robot", "answered_us": 43_200, "version": null, "path": path, "error": null, "fix": "",
+        });
+        assert_eq!(serde_json::to_value(AnswerJson::of("robot", &answer)).unwrap(), told);
         let own = ReportAnswer { answered_us: 900, ..ReportAnswer::default() };
         assert_eq!(said(&own), ["robot answered after 0.90 ms, the node here"]);
         let error = ReportAnswer {
@@ -113,6 +149,7 @@ mod tests {
             ..ReportAnswer::default()
         };
         assert_eq!(said(&error), ["robot: it does not answer", "  try again"]);
+        assert_eq!(AnswerJson::of("robot", &error).answered_us, None);
     }
 
     #[test]
