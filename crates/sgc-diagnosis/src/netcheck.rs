@@ -30,7 +30,7 @@ pub struct Netcheck {
     ipv6: Ipv6,
 }
 
-/// What a router that this node dialled sees of it.
+/// A way to a router that this node dialled, with the address that the router sees.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 struct RouterView {
     url: String,
@@ -89,7 +89,7 @@ enum Mapping {
     Unknown,
 }
 
-/// What there is of IPv6.
+/// The use of IPv6, and the host's route to it.
 #[derive(Debug, PartialEq, Eq, Serialize)]
 struct Ipv6 {
     /// Whether a link uses it.
@@ -102,8 +102,7 @@ impl Netcheck {
     /// Returns what the status of a node reveals of its network.
     pub fn of(status: &Status) -> Self {
         let links: Vec<_> = status.links.iter().filter_map(RouterView::of).collect();
-        let is_linked = |router: &&Router| links.iter().any(|link| Some(&link.url) == router.at.as_ref());
-        let not_linked = status.routers.iter().filter(|router| !is_linked(router));
+        let not_linked = status.routers.iter().filter(|router| router.link(&status.links).is_none());
         let not_linked = not_linked.map(|router| NotLinked {
             router: router.router.clone(),
             state: router.state.clone(),
@@ -142,20 +141,20 @@ impl Netcheck {
             );
         }
         lines.push(Line::default());
-        let said = [self.udp_line(), self.nat_line(), self.mapping_line(), Some(self.ipv6_line())];
+        let said = [Some(self.udp_line()), self.nat_line(), self.mapping_line(), Some(self.ipv6_line())];
         lines.extend(said.into_iter().flatten().map(|part| Line::new([part])));
         lines
     }
 
-    fn udp_line(&self) -> Option<Toned> {
-        Some(match self.udp {
+    fn udp_line(&self) -> Toned {
+        match self.udp {
             Udp::Passes => Toned::new(Tone::Good, "UDP passes."),
             Udp::SeemsBlocked => Toned::new(
                 Tone::Attention,
                 "UDP seems to be blocked: the node took another way than the ones over UDP that its routers have.",
             ),
             Udp::Unknown => "UDP: not known, because no link is up that would tell.".into(),
-        })
+        }
     }
 
     fn nat_line(&self) -> Option<Toned> {

@@ -126,7 +126,7 @@ pub struct Router {
     /// The router as configured.
     pub router: String,
     found_by: String,
-    pub(crate) at: Option<String>,
+    at: Option<String>,
     pub(crate) state: String,
     why_not_first: Option<String>,
     /// Failures since the last success.
@@ -339,10 +339,13 @@ impl Link {
 }
 
 impl Router {
+    /// Returns the link to the router, if it is up.
+    pub(crate) fn link<'a>(&self, links: &'a [Link]) -> Option<&'a Link> {
+        links.iter().find(|link| link.url.is_some() && link.url == self.at)
+    }
+
     fn row(&self, links: &[Link]) -> Vec<Toned> {
-        let is_up = |link: &&Link| link.url.is_some() && link.url == self.at;
-        let link = links.iter().find(is_up);
-        let state = match (self.again_in_s, link) {
+        let state = match (self.again_in_s, self.link(links)) {
             (Some(s), _) => Toned::new(Tone::Bad, format!("{} in {}", self.state, duration(s))),
             (None, Some(link)) if link.silent => Toned::new(Tone::Bad, format!("{}, silent", self.state)),
             (None, Some(_)) => Toned::new(Tone::Good, &self.state),

@@ -41,15 +41,17 @@ pub enum AttemptResult {
     StandBack,
 }
 
+/// Returns `true` for an address and port that one host can have.
+pub fn is_of_host(address: &SocketAddr) -> bool {
+    let ip = address.ip();
+    let broadcast = matches!(ip, IpAddr::V4(v4) if v4.is_broadcast());
+    address.port() != 0 && !ip.is_unspecified() && !ip.is_multicast() && !broadcast
+}
+
 impl Candidates {
     /// Adds an announced router or its new addresses. Returns `false` if there is no room.
     pub fn announced(&mut self, instance: &str, addresses: impl IntoIterator<Item = SocketAddr>) -> bool {
-        let usable = |address: &SocketAddr| {
-            let ip = address.ip();
-            let broadcast = matches!(ip, IpAddr::V4(v4) if v4.is_broadcast());
-            address.port() != 0 && !ip.is_unspecified() && !ip.is_multicast() && !broadcast
-        };
-        let addresses: BTreeSet<_> = addresses.into_iter().filter(usable).collect();
+        let addresses: BTreeSet<_> = addresses.into_iter().filter(is_of_host).collect();
         let addresses: Vec<_> = addresses.into_iter().take(ADDRESSES_MAX).collect();
         if addresses.is_empty() {
             self.known.remove(instance);

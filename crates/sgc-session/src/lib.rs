@@ -21,7 +21,7 @@ pub use bulk::{
     BULK_MESSAGE_BYTES_MIN, BulkEnd, BulkLaneObservation, BulkLaneUse, BulkMeter, BulkPath,
     BulkPathObservation,
 };
-pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates};
+pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates, is_of_host};
 pub use claims::ClaimTable;
 pub use failback::Failback;
 pub use keep_alive::{ASK_MAX, Activity, KeepAlive, KeepAlivePolicy, LinkObservation, PeerState, Verdict};

@@ -6,12 +6,12 @@
 //! time out.
 
 use std::collections::{BTreeMap, HashMap};
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_router::LinkId;
-use sgc_session::{KeepAlive, KeepAlivePolicy, LinkObservation};
+use sgc_session::{KeepAlive, KeepAlivePolicy, LinkObservation, is_of_host};
 use sgc_transport::{AnyLink, CloseReason, Link, LinkStats};
 use sgc_trust::VerifiedPeer;
 use sgc_wire::{Control, Name, NodeId};
@@ -165,7 +165,7 @@ impl LinkTable {
     pub(crate) fn tell_address(&mut self, id: LinkId) {
         let Some(entry) = self.links.get_mut(&id).filter(|entry| entry.url.is_none()) else { return };
         let remote = entry.link.remote();
-        // What a full queue does not take is told at the next look.
+        // An address that a full queue does not take is told at the next look.
         if entry.told != Some(remote) && entry.control.send(Control::ObservedAddress { place: remote.into() })
         {
             entry.told = Some(remote);
@@ -230,13 +230,6 @@ impl LinkTable {
         };
         self.links.values().map(leave).collect()
     }
-}
-
-/// Returns `true` for an address from which the packets of one host can come.
-fn is_of_host(address: &SocketAddr) -> bool {
-    let ip = address.ip();
-    let is_broadcast = matches!(ip, IpAddr::V4(v4) if v4.is_broadcast());
-    address.port() != 0 && !ip.is_unspecified() && !ip.is_multicast() && !is_broadcast
 }
 
 impl LinkEntry {
