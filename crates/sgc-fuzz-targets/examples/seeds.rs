@@ -1,21 +1,25 @@
 //! Writes valid inputs of each kind to `fuzz/corpus/`, from which a fuzzer reaches more code than from an empty corpus:
 //! `cargo run -p sgc-fuzz-targets --example seeds`.
 
+use std::net::SocketAddr;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use std::{fs, io};
 
 use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
+use sgc_fuzz_targets::checks::Meeting;
+use sgc_session::DirectOutput;
 use sgc_trust::{EnrollRequest, Fleet, KeyRequest, MessageKey, ShareToken, Suite, TopicSecret};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Challenge, Class,
-    Consumer, Control, Credentials, DescribedType, Encode, GrantContent, Hello, JoinBody, MessageHead,
-    MessageKind, Metadata, Name, OperationAnswer, PayloadEncoding, PayloadForm, Place, Qos, Recover,
-    RefuseReason, RejectReason, Report, ReportQuestion, Request, Role, RosNode, SecretBytes,
-    SecretGeneration, SignedBody, SinkId, SourceId, SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
+    AdvertBody, Answer, AnswerBody, Blind, CandidateKind, Catalogue, CatalogueEntry, CatalogueSource,
+    Challenge, Class, Consumer, Control, Credentials, DescribedType, Encode, GrantContent, Hello, JoinBody,
+    MessageHead, MessageKind, Metadata, Name, OperationAnswer, PathCandidate, PathOffer, PayloadEncoding,
+    PayloadForm, Place, Qos, Recover, RefuseReason, RejectReason, Report, ReportQuestion, Request, Role,
+    RosNode, SecretBytes, SecretGeneration, SignedBody, SinkId, SourceId, SourceOffer, TopicGrant,
+    TypeQuestion, UnixMillis,
 };
 
 /// The time of the targets.
@@ -42,8 +46,34 @@ fn main() -> io::Result<()> {
     write("packet", packets(Suite::ALL.as_slice()))?;
     write("certs", certs())?;
     write("sink", sink())?;
+    write("checks", checks())?;
     write("grants", grants())?;
     write("gateway", gateway())
+}
+
+/// Returns authentic checks of the peer, also from elsewhere, and one that is not.
+fn checks() -> Vec<Vec<u8>> {
+    let mut now = Instant::now();
+    let Meeting { mut far, .. } = Meeting::new(now);
+    let mut datagrams = Vec::new();
+    for _ in 0..20 {
+        now += Duration::from_millis(50);
+        far.handle_timeout(now);
+        let sent = std::iter::from_fn(|| far.poll()).filter_map(|output| match output {
+            DirectOutput::Send { datagram, .. } => Some(datagram),
+            _ => None,
+        });
+        datagrams.extend(sent);
+    }
+    let framed = |source: u8, datagram: &[u8]| {
+        [&[source], &(datagram.len() as u16).to_be_bytes()[..], datagram].concat()
+    };
+    let all = |source: fn(usize) -> u8| {
+        datagrams.iter().enumerate().flat_map(|(n, datagram)| framed(source(n), datagram)).collect()
+    };
+    let mut altered = datagrams.first().cloned().unwrap_or_default();
+    altered.iter_mut().skip(20).step_by(7).for_each(|byte| *byte ^= 1);
+    vec![all(|_| 2), all(|n| n as u8 + 3), framed(2, &altered)]
 }
 
 /// Returns conversations by the rosbridge protocol and by Foxglove's.
@@ -191,6 +221,13 @@ fn bodies() -> Vec<Vec<u8>> {
     let document = Bytes::from_static(b"{\"version\":\"1\"}");
     all.push((9, Report { encoding: PayloadEncoding::Plain, document }.to_vec()));
     all.push((8, ReportQuestion::Ping.to_vec()));
+    let candidate = PathCandidate {
+        kind: CandidateKind::ServerReflexive,
+        place: SocketAddr::from(([203, 0, 113, 7], 40_000)).into(),
+    };
+    let password = SecretBytes::new([5; 32]);
+    let offer = PathOffer { attempt: 1, user: [2; 4], password, candidates: vec![candidate] };
+    all.push((3, GrantContent::Path(offer).to_vec()));
     all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
 }
 

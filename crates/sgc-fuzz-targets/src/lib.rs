@@ -19,6 +19,7 @@ pub mod access;
 pub mod bodies;
 pub mod cdr;
 pub mod certs;
+pub mod checks;
 pub mod control;
 pub mod dtls;
 pub mod dtls_handshake;
@@ -39,6 +40,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("bodies", bodies::run),
     ("cdr", cdr::run),
     ("certs", certs::run),
+    ("checks", checks::run),
     ("control", control::run),
     ("dtls", dtls::run),
     ("dtls_handshake", dtls_handshake::run),

@@ -17,6 +17,8 @@ const ASK_FLOOR: Duration = Duration::from_secs(5);
 const ACTIVE_FOR: Duration = Duration::from_secs(30);
 /// Time for an answer before the link counts as silent: lower bound, upper bound, and multiple of the round-trip time.
 const ANSWER_MIN: Duration = Duration::from_millis(1500);
+/// The same lower bound for a direct link, beside which there is the path over routers.
+const DIRECT_ANSWER_MIN: Duration = Duration::from_secs(1);
 const ANSWER_MAX: Duration = Duration::from_secs(5);
 const ANSWER_RTTS: u32 = 4;
 /// Time for an answer before the link counts as dead.
@@ -129,6 +131,8 @@ enum Waiting {
 #[derive(Debug)]
 pub struct KeepAlive {
     policy: KeepAlivePolicy,
+    /// Shortest time for an answer.
+    answer_min: Duration,
     /// Silence before the next probe, at most `policy.max`.
     step: Duration,
     received_bytes: u64,
@@ -144,6 +148,7 @@ impl KeepAlive {
     pub fn new(now: Instant, policy: KeepAlivePolicy, received_bytes: u64, remote: SocketAddr) -> Self {
         Self {
             policy,
+            answer_min: ANSWER_MIN,
             step: ASK_MIN,
             received_bytes,
             remote,
@@ -152,6 +157,11 @@ impl KeepAlive {
             looked: now,
             waiting: Waiting::ToAsk,
         }
+    }
+
+    /// Notes that this is a direct link: while it is in doubt, routers have another path.
+    pub fn set_direct(&mut self) {
+        self.answer_min = DIRECT_ANSWER_MIN;
     }
 
     /// Returns the silence after which the peer is probed.
@@ -202,7 +212,7 @@ impl KeepAlive {
                 if asks {
                     *last = now;
                 }
-                let answer_max = (ANSWER_RTTS * seen.rtt).clamp(ANSWER_MIN, ANSWER_MAX);
+                let answer_max = (ANSWER_RTTS * seen.rtt).clamp(self.answer_min, ANSWER_MAX);
                 let peer = match now.saturating_duration_since(*first) {
                     waited if waited >= DEAD_AFTER => PeerState::Dead,
                     waited if waited >= answer_max => PeerState::Silent,
@@ -315,6 +325,25 @@ mod tests {
             }
             (self.now - start).as_secs_f64()
         }
+    }
+
+    #[test]
+    fn direct_link_is_in_doubt_sooner_than_one_without_an_alternative() {
+        let silent_after = |is_direct: bool| {
+            let mut bench = Bench::new(KeepAlivePolicy::default());
+            if is_direct {
+                bench.keep_alive.set_direct();
+            }
+            bench.run(10);
+            bench.answers = false;
+            bench.activity.note();
+            let begun = bench.now;
+            while !bench.verdict.is_silent() {
+                bench.look();
+            }
+            bench.now - begun
+        };
+        assert_eq!((silent_after(true), silent_after(false)), (5 * LOOK, 6 * LOOK));
     }
 
     #[test]

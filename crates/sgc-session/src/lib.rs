@@ -9,6 +9,7 @@ mod backoff;
 mod bulk;
 mod candidates;
 mod claims;
+mod direct;
 mod failback;
 mod keep_alive;
 mod origin;
@@ -23,6 +24,10 @@ pub use bulk::{
 };
 pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates, is_of_host};
 pub use claims::ClaimTable;
+pub use direct::{
+    DIRECT_ATTEMPT_MAX, DIRECT_ATTEMPTS_MAX, DIRECT_PEERS_MAX, DirectOutput, DirectPaths, LocalAddress,
+    NoDirectPath, is_checkable,
+};
 pub use failback::Failback;
 pub use keep_alive::{ASK_MAX, Activity, KeepAlive, KeepAlivePolicy, LinkObservation, PeerState, Verdict};
 pub use origin::{Move, Origin};

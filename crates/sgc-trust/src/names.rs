@@ -101,6 +101,12 @@ pub fn reports_blind(node: &NodeId) -> Blind {
     blind_of(b"sgc reports v1", &node.0)
 }
 
+/// Returns the blind for questions to a node about its addresses: everyone who knows the node can derive it, since the
+/// node decides who gets an answer.
+pub fn paths_blind(node: &NodeId) -> Blind {
+    blind_of(b"sgc paths v1", &node.0)
+}
+
 /// Returns `SHA-256(label ‖ id)`, a blind that needs no secret.
 fn blind_of(label: &[u8], id: &[u8]) -> Blind {
     let mut context = digest::Context::new(&digest::SHA256);

@@ -107,6 +107,14 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
         name_of(&owner, &reports_blind(&owner)).to_string(),
         "a51d8957bcee62f91c39f990fc8cfac2ca7b602dcf775061ecf3a02157bb5363"
     );
+    assert_eq!(
+        paths_blind(&owner).to_string(),
+        "3228a42645607adeef0f3729d6394f4d887ba2b7719476e9d2c9c2a019e7c51f"
+    );
+    assert_eq!(
+        name_of(&owner, &paths_blind(&owner)).to_string(),
+        "79ba6d7f59ef5801396d45bb59b96e1892070495b1e9c27d9f5a768c901b4df2"
+    );
 }
 
 #[test]

@@ -11,6 +11,7 @@ use crate::ids::{Blind, SecretBytes, SourceId};
 use crate::metadata::Metadata;
 use crate::operation::OperationAnswer;
 use crate::packet::Class;
+use crate::path::PathOffer;
 use crate::qos::Qos;
 use crate::report::Report;
 use crate::ros_node::RosNode;
@@ -46,6 +47,8 @@ pub enum GrantContent {
     Consumers(Vec<Consumer>),
     /// A node's report for an observer.
     Report(Report),
+    /// Where a node can be reached without a router.
+    Path(PathOffer),
 }
 
 /// One epoch of one topic.
@@ -216,6 +219,10 @@ impl Encode for GrantContent {
                 w.u8(6);
                 report.encode(w);
             }
+            Self::Path(offer) => {
+                w.u8(7);
+                offer.encode(w);
+            }
         }
     }
 }
@@ -249,6 +256,7 @@ impl Decode for GrantContent {
             4 => Ok(Self::Operation(OperationAnswer::decode(r)?)),
             5 => Ok(Self::Consumers(r.list("consumers", CONSUMERS_MAX, Consumer::decode)?)),
             6 => Ok(Self::Report(Report::decode(r)?)),
+            7 => Ok(Self::Path(PathOffer::decode(r)?)),
             v => Err(DecodeError::value("grant content", v.into())),
         }
     }

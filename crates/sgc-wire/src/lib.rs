@@ -15,6 +15,7 @@ mod message;
 mod metadata;
 mod operation;
 mod packet;
+mod path;
 mod qos;
 mod report;
 mod ros_node;
@@ -52,6 +53,9 @@ pub use operation::{
 pub use packet::{
     AssociatedData, Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, LABEL_SAVES_BYTES, MESSAGE_BYTES_MAX,
     PACKET_VERSION, PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload,
+};
+pub use path::{
+    CandidateKind, PATH_CANDIDATES_MAX, PATH_OFFER_BYTES, PathCandidate, PathOffer, PathQuestion,
 };
 pub use qos::{Durability, History, Liveliness, Qos, Reliability, Representations};
 pub use report::{

@@ -45,8 +45,10 @@ pub(crate) fn log_filter(text: &str) -> Result<EnvFilter, LogFilterError> {
             return Err(LogFilterError::UnknownTarget { written: name.to_owned() });
         }
     }
+    // Strangers can have the ICE agent warn of odd messages. Whoever names it hears it.
+    let quiet = ["is=error"];
     EnvFilter::builder()
-        .parse(directives.join(","))
+        .parse(quiet.iter().chain(&directives).copied().collect::<Vec<_>>().join(","))
         .map_err(|error| LogFilterError::Other { reason: error.to_string() })
 }
 
@@ -96,9 +98,13 @@ mod tests {
             "sgc_node::core=trace, quinn=off",
             "sgc=info",
             "sgc_sync=debug",
+            "is=trace",
         ] {
             assert!(log_filter(right).is_ok(), "{right}");
         }
+        let shown = |text: &str| log_filter(text).map(|filter| filter.to_string());
+        assert_eq!(shown("info"), Ok("is=error,info".to_owned()));
+        assert_eq!(shown("is=debug,warn"), Ok("is=debug,warn".to_owned()));
         let level = |written: &str| LogFilterError::Level { written: written.to_owned() };
         let target = |written: &str| LogFilterError::Target { written: written.to_owned() };
         for (wrong, error) in [

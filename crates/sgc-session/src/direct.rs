@@ -1,0 +1,421 @@
+//! Direct paths: [`DirectPaths`] finds, with each peer that this node exchanges data with, a pair of addresses between
+//! which packets pass without a router.
+//!
+//! Both nodes ask each other for their addresses through their routers. Then each runs connectivity checks (ICE, RFC
+//! 8445) from the socket of its links, in the agent of the crate `is`. The node with the lesser id controls: it dials the
+//! pair that it nominates. The other accepts a link from the addresses whose checks it authenticated.
+//!
+//! Checks go to addresses that a peer names or forges, so an attempt sends no more to addresses that have not answered
+//! than the peer's offer and its checks have bytes.
+
+mod addresses;
+mod attempt;
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use is::stun::StunMessage;
+use rand_chacha::ChaCha20Rng;
+use rand_core::RngCore as _;
+use sgc_wire::{NodeId, PathOffer, PathQuestion};
+
+pub use self::addresses::{LocalAddress, is_checkable};
+use self::attempt::{Attempt, Progress};
+use crate::backoff::doubled;
+
+/// Most peers with which this node has, or looks for, a direct path.
+pub const DIRECT_PEERS_MAX: usize = 256;
+/// Most attempts at one time.
+pub const DIRECT_ATTEMPTS_MAX: usize = 32;
+/// Longest time for an attempt, from the question to the link.
+pub const DIRECT_ATTEMPT_MAX: Duration = Duration::from_secs(10);
+/// Shortest wait, before jitter, after an attempt that failed. It is doubled each time.
+const RETRY_MIN: Duration = Duration::from_secs(2);
+/// Longest such wait.
+const RETRY_MAX: Duration = Duration::from_secs(300);
+/// A link that was up for less counts as a failure, so that a path that works badly is not used again and again.
+const LINK_PROVEN_AFTER: Duration = Duration::from_secs(60);
+/// Shortest time between two attempts that one peer begins.
+const ASKED_EVERY: Duration = Duration::from_secs(1);
+
+/// Work for the driver.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum DirectOutput {
+    /// Ask the peer for its addresses, in place of an earlier question.
+    Ask {
+        /// The peer.
+        peer: NodeId,
+        /// The question.
+        question: PathQuestion,
+    },
+    /// End the question to the peer.
+    Leave {
+        /// The peer.
+        peer: NodeId,
+    },
+    /// Send a check, or the answer to one.
+    Send {
+        /// The address to send from.
+        from: SocketAddr,
+        /// The address to send to.
+        to: SocketAddr,
+        /// The datagram.
+        datagram: Vec<u8>,
+    },
+    /// Accept a link of the peer from this address.
+    Admit {
+        /// The peer.
+        peer: NodeId,
+        /// The address.
+        from: SocketAddr,
+    },
+    /// Accept no more links of the peer.
+    Shut {
+        /// The peer.
+        peer: NodeId,
+    },
+    /// Dial the peer.
+    Dial {
+        /// The peer.
+        peer: NodeId,
+        /// The address.
+        to: SocketAddr,
+    },
+}
+
+/// Reasons why there is no direct path to a peer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NoDirectPath {
+    /// The first attempt is under way.
+    #[error("a direct path is being looked for")]
+    First,
+    /// The peer did not tell its addresses.
+    #[error(
+        "the peer does not answer the question for its addresses: its version is older, or `direct` there is \"never\""
+    )]
+    Unanswered,
+    /// The peer permits no direct link with this node.
+    #[error("the peer permits no direct link with this node")]
+    Refused,
+    /// No check was answered.
+    #[error("no packet passes between the two networks: a NAT or a firewall on the way drops them")]
+    Blocked,
+    /// Checks were answered, and no link came of it.
+    #[error("packets pass, and no link was made")]
+    NoLink,
+    /// There was a link, and it ended.
+    #[error("the direct link ended")]
+    Lost,
+    /// This node has no address that a peer could reach.
+    #[error("this node has no address that the peer could reach")]
+    NoAddress,
+    /// Too many attempts are under way.
+    #[error("{DIRECT_ATTEMPTS_MAX} other attempts are under way")]
+    Busy,
+}
+
+/// The path to a peer.
+#[derive(Debug)]
+struct Peer {
+    /// This node exchanges data with it.
+    is_wanted: bool,
+    attempt: Option<Box<Attempt>>,
+    /// Time since which a direct link is up.
+    linked: Option<Instant>,
+    failures: u32,
+    retry_at: Option<Instant>,
+    why_not: NoDirectPath,
+    /// Time from which it may begin another attempt.
+    may_ask_at: Option<Instant>,
+}
+
+impl Peer {
+    fn new(is_wanted: bool, now: Instant) -> Self {
+        Self {
+            is_wanted,
+            attempt: None,
+            linked: None,
+            failures: 0,
+            retry_at: is_wanted.then_some(now),
+            why_not: NoDirectPath::First,
+            may_ask_at: None,
+        }
+    }
+
+    fn is_idle(&self) -> bool {
+        !self.is_wanted && self.attempt.is_none() && self.linked.is_none()
+    }
+}
+
+/// The direct paths of a node.
+#[derive(Debug)]
+pub struct DirectPaths {
+    own: NodeId,
+    rng: ChaCha20Rng,
+    local: Vec<LocalAddress>,
+    peers: BTreeMap<NodeId, Peer>,
+    outputs: VecDeque<DirectOutput>,
+    /// Checks that were not sent, because the peer's offer paid for no more.
+    withheld: u64,
+    /// Candidates of peers that no host of theirs can have, or that must not be checked.
+    refused_candidates: u64,
+}
+
+impl DirectPaths {
+    /// Creates the machine of the node `own`, without addresses. Passwords are drawn from `rng`.
+    pub fn new(own: NodeId, rng: ChaCha20Rng) -> Self {
+        Self {
+            own,
+            rng,
+            local: Vec::new(),
+            peers: BTreeMap::new(),
+            outputs: VecDeque::new(),
+            withheld: 0,
+            refused_candidates: 0,
+        }
+    }
+
+    /// Sets the addresses of this node. If they changed, the network did: attempts begin anew, and those that wait are
+    /// due.
+    pub fn set_local(&mut self, now: Instant, local: Vec<LocalAddress>) {
+        if self.local == local {
+            return;
+        }
+        self.local = local;
+        for (node, peer) in &mut self.peers {
+            if peer.attempt.take().is_some() {
+                self.outputs.push_back(DirectOutput::Leave { peer: *node });
+            }
+            if peer.linked.is_none() && peer.is_wanted {
+                (peer.failures, peer.retry_at) = (0, Some(now));
+            }
+        }
+    }
+
+    /// Sets the peers with which this node exchanges data, beyond those that look for a path to it.
+    pub fn want(&mut self, now: Instant, wanted: &BTreeSet<NodeId>) {
+        for (node, peer) in &mut self.peers {
+            let is_wanted = wanted.contains(node);
+            if is_wanted && !peer.is_wanted && peer.linked.is_none() && peer.attempt.is_none() {
+                peer.retry_at = Some(peer.retry_at.map_or(now, |at| at.max(now)));
+            }
+            peer.is_wanted = is_wanted;
+        }
+        for node in wanted.iter().filter(|node| **node != self.own) {
+            if self.peers.len() < DIRECT_PEERS_MAX {
+                self.peers.entry(*node).or_insert_with(|| Peer::new(true, now));
+            }
+        }
+        // What failed is remembered until the peer may be tried again.
+        self.peers.retain(|_, peer| !peer.is_idle() || peer.retry_at.is_some_and(|at| at > now));
+    }
+
+    /// Takes the question of a peer that may have a direct link. Returns the answer; `None` if it asks too often, or
+    /// there is no room.
+    pub fn asked(&mut self, now: Instant, node: NodeId, question: PathQuestion) -> Option<PathOffer> {
+        let under_way = self.attempts();
+        let is_full = self.peers.len() >= DIRECT_PEERS_MAX;
+        let peer = match self.peers.get_mut(&node) {
+            Some(peer) => peer,
+            None if is_full || node == self.own => return None,
+            None => self.peers.entry(node).or_insert_with(|| Peer::new(false, now)),
+        };
+        let is_new = peer.attempt.is_none();
+        if let Some(attempt) = &mut peer.attempt
+            && attempt.is_with(question.attempt)
+        {
+            return Some(attempt.offer());
+        }
+        if peer.may_ask_at.is_some_and(|at| at > now) || (is_new && under_way >= DIRECT_ATTEMPTS_MAX) {
+            return None;
+        }
+        peer.may_ask_at = Some(now + ASKED_EVERY);
+        self.begin(now, node);
+        let attempt = self.peers.get_mut(&node)?.attempt.as_mut()?;
+        attempt.is_with(question.attempt).then(|| attempt.offer())
+    }
+
+    /// Takes the answer of a peer.
+    pub fn offered(&mut self, now: Instant, node: NodeId, offer: &PathOffer) {
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        let Some(attempt) = &mut peer.attempt else { return };
+        self.outputs.push_back(DirectOutput::Leave { peer: node });
+        if !attempt.take_offer(now, offer, &mut self.refused_candidates) {
+            // The peer began anew in between.
+            self.begin(now, node);
+        }
+        self.advance(now, node);
+    }
+
+    /// Notes that the peer, or a router before it, refuses its addresses.
+    pub fn refused(&mut self, now: Instant, node: NodeId) {
+        if self.peers.get(&node).is_some_and(|peer| peer.attempt.is_some()) {
+            self.fail(now, node, NoDirectPath::Refused);
+        }
+    }
+
+    /// Takes a datagram that looks like a check. Returns `false` if it is none of an attempt under way.
+    pub fn received(&mut self, now: Instant, to: SocketAddr, from: SocketAddr, datagram: &[u8]) -> bool {
+        let Ok(message) = StunMessage::parse(datagram) else { return false };
+        let mut attempts = self.peers.iter().filter_map(|(node, peer)| Some((*node, peer.attempt.as_ref()?)));
+        let Some(node) = attempts.find(|(_, attempt)| attempt.accepts(&message)).map(|(node, _)| node) else {
+            return false;
+        };
+        if let Some(attempt) = self.peers.get_mut(&node).and_then(|peer| peer.attempt.as_mut()) {
+            attempt.receive(now, to, from, (message, datagram.len()));
+        }
+        self.advance(now, node);
+        true
+    }
+
+    /// Returns `true` if a link of this peer at this address comes of an attempt.
+    pub fn is_expected(&self, node: &NodeId, address: SocketAddr) -> bool {
+        let attempt = self.peers.get(node).and_then(|peer| peer.attempt.as_ref());
+        attempt.is_some_and(|attempt| attempt.expects(address))
+    }
+
+    /// Notes that a direct link to a peer is up.
+    pub fn linked(&mut self, now: Instant, node: NodeId) {
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        if peer.attempt.take().is_some() {
+            self.outputs.push_back(DirectOutput::Leave { peer: node });
+        }
+        (peer.linked, peer.retry_at) = (Some(now), None);
+    }
+
+    /// Notes that the last direct link to a peer ended.
+    pub fn ended(&mut self, now: Instant, node: NodeId) {
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        let Some(since) = peer.linked.take() else { return };
+        self.outputs.push_back(DirectOutput::Shut { peer: node });
+        peer.why_not = NoDirectPath::Lost;
+        let is_proven = now.saturating_duration_since(since) >= LINK_PROVEN_AFTER;
+        peer.failures = if is_proven { 1 } else { peer.failures.saturating_add(1) };
+        let wait = doubled(RETRY_MIN, peer.failures, RETRY_MAX, &mut self.rng);
+        peer.retry_at = Some(now + wait);
+    }
+
+    /// Notes that the link that was dialled was not made.
+    pub fn not_dialled(&mut self, now: Instant, node: NodeId) {
+        if self.peers.get(&node).is_some_and(|peer| peer.attempt.is_some()) {
+            self.fail(now, node, NoDirectPath::NoLink);
+        }
+    }
+
+    /// Acts on timers that are due.
+    pub fn handle_timeout(&mut self, now: Instant) {
+        let due = |peer: &Peer| {
+            peer.attempt.is_none()
+                && peer.is_wanted
+                && peer.linked.is_none()
+                && peer.retry_at.is_some_and(|at| at <= now)
+        };
+        let begin: Vec<_> = self.peers.iter().filter(|(_, peer)| due(peer)).map(|(node, _)| *node).collect();
+        for node in begin {
+            if self.local.is_empty() {
+                self.wait(now, node, NoDirectPath::NoAddress);
+            } else if self.attempts() >= DIRECT_ATTEMPTS_MAX {
+                self.wait(now, node, NoDirectPath::Busy);
+            } else {
+                self.begin(now, node);
+            }
+        }
+        let under_way: Vec<_> =
+            self.peers.iter().filter(|(_, peer)| peer.attempt.is_some()).map(|(node, _)| *node).collect();
+        for node in under_way {
+            self.advance(now, node);
+        }
+    }
+
+    /// Returns the time at which to call [`Self::handle_timeout`].
+    pub fn deadline(&mut self) -> Option<Instant> {
+        let times = self.peers.values_mut().filter_map(|peer| match &mut peer.attempt {
+            Some(attempt) => Some(attempt.deadline()),
+            None => peer.retry_at.filter(|_| peer.is_wanted && peer.linked.is_none()),
+        });
+        times.min()
+    }
+
+    /// Returns the next output.
+    pub fn poll(&mut self) -> Option<DirectOutput> {
+        self.outputs.pop_front()
+    }
+
+    /// Iterates over the peers with which data is exchanged and to which there is no direct path, with the reason.
+    pub fn relayed(&self) -> impl Iterator<Item = (NodeId, NoDirectPath)> {
+        let relayed = self.peers.iter().filter(|(_, peer)| peer.is_wanted && peer.linked.is_none());
+        relayed.map(|(node, peer)| (*node, peer.why_not))
+    }
+
+    /// Returns `true` if a check may arrive.
+    pub fn has_attempts(&self) -> bool {
+        self.attempts() > 0
+    }
+
+    /// Returns the number of checks that were not sent because the offers paid for no more, and that of refused
+    /// candidates.
+    pub fn refusals(&self) -> (u64, u64) {
+        (self.withheld, self.refused_candidates)
+    }
+
+    fn attempts(&self) -> usize {
+        self.peers.values().filter(|peer| peer.attempt.is_some()).count()
+    }
+
+    /// Begins an attempt, in place of one under way.
+    fn begin(&mut self, now: Instant, node: NodeId) {
+        let is_controlling = self.own < node;
+        let attempt = Attempt::new(now, is_controlling, &self.local, &mut self.rng);
+        let question = PathQuestion { attempt: attempt.number() };
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        (peer.attempt, peer.retry_at) = (Some(Box::new(attempt)), None);
+        self.outputs.push_back(DirectOutput::Shut { peer: node });
+        self.outputs.push_back(DirectOutput::Ask { peer: node, question });
+    }
+
+    /// Lets an attempt go on, and passes on its results.
+    fn advance(&mut self, now: Instant, node: NodeId) {
+        let Some(attempt) = self.peers.get_mut(&node).and_then(|peer| peer.attempt.as_mut()) else { return };
+        let progress = attempt.advance(now, &mut self.withheld);
+        let Progress { sent, admitted, dialled } = progress;
+        for (from, to, datagram) in sent {
+            self.outputs.push_back(DirectOutput::Send { from, to, datagram });
+        }
+        for from in admitted {
+            self.outputs.push_back(DirectOutput::Admit { peer: node, from });
+        }
+        if let Some(to) = dialled {
+            self.outputs.push_back(DirectOutput::Dial { peer: node, to });
+        }
+        let over = attempt.over(now);
+        if let Some(why) = over {
+            self.fail(now, node, why);
+        }
+    }
+
+    fn fail(&mut self, now: Instant, node: NodeId, why: NoDirectPath) {
+        self.outputs.push_back(DirectOutput::Leave { peer: node });
+        self.outputs.push_back(DirectOutput::Shut { peer: node });
+        self.wait(now, node, why);
+    }
+
+    /// Lets a peer wait for the next attempt.
+    fn wait(&mut self, now: Instant, node: NodeId, why: NoDirectPath) {
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        peer.attempt = None;
+        peer.failures = peer.failures.saturating_add(1);
+        peer.why_not = why;
+        peer.retry_at = Some(now + doubled(RETRY_MIN, peer.failures, RETRY_MAX, &mut self.rng));
+    }
+}
+
+/// Draws bytes.
+fn draw<const N: usize>(rng: &mut ChaCha20Rng) -> [u8; N] {
+    let mut bytes = [0; N];
+    rng.fill_bytes(&mut bytes);
+    bytes
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,278 @@
+//! One attempt to find a path to a peer.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use aws_lc_rs::hmac;
+use is::stun::{StunMessage, StunPacket};
+use is::{Candidate, IceAgent, IceAgentEvent, IceCreds, Protocol, Sha1HmacProvider};
+use rand_chacha::ChaCha20Rng;
+use sgc_wire::{CandidateKind, PATH_CANDIDATES_MAX, PATH_OFFER_BYTES, PathCandidate, PathOffer, SecretBytes};
+
+use super::addresses::{LocalAddress, is_checkable};
+use super::{DIRECT_ATTEMPT_MAX, NoDirectPath, draw};
+
+/// Time between two checks, and before the first repetition of one.
+const CHECK_PACE: Duration = Duration::from_millis(20);
+const CHECK_AGAIN_AFTER: Duration = Duration::from_millis(100);
+/// Longest time between two checks of one pair.
+const CHECK_EVERY_MAX: Duration = Duration::from_millis(500);
+/// Most pairs of addresses that are checked.
+const PAIRS_MAX: usize = 64;
+/// Most addresses from which checks of the peer are taken: with its password, it can have them come from anywhere.
+const SOURCES_MAX: usize = 32;
+/// Time for a better pair to answer, after one did.
+const SETTLE: Duration = Duration::from_millis(60);
+
+/// HMAC-SHA1 for the agent, as RFC 8489 demands.
+#[derive(Debug)]
+struct Mac;
+
+impl Sha1HmacProvider for Mac {
+    fn sha1_hmac(&self, key: &[u8], payloads: &[&[u8]]) -> [u8; 20] {
+        let mut context = hmac::Context::with_key(&hmac::Key::new(hmac::HMAC_SHA1_FOR_LEGACY_USE_ONLY, key));
+        payloads.iter().for_each(|part| context.update(part));
+        let mut out = [0; 20];
+        out.copy_from_slice(context.sign().as_ref());
+        out
+    }
+}
+
+/// An attempt under way.
+pub(super) struct Attempt {
+    number: u64,
+    user: [u8; 4],
+    password: SecretBytes,
+    candidates: Vec<PathCandidate>,
+    agent: IceAgent,
+    /// The peer's attempt, once it is known, and whether its offer was taken.
+    peer: Option<u64>,
+    has_offer: bool,
+    is_controlling: bool,
+    until: Instant,
+    /// Bytes that may still be sent to addresses that have not answered.
+    allowance: usize,
+    /// Addresses that answered a check, and so are of the peer.
+    answered: BTreeSet<SocketAddr>,
+    /// Addresses from which authentic checks came. Their senders may have forged them.
+    sources: BTreeSet<SocketAddr>,
+    /// The best address of the peer so far, and the time from which it is used.
+    nominated: Option<(SocketAddr, Instant)>,
+    dialled: Option<SocketAddr>,
+    admitted: BTreeSet<SocketAddr>,
+}
+
+/// Results of an attempt since the last look.
+#[derive(Debug, Default)]
+pub(super) struct Progress {
+    pub(super) sent: Vec<(SocketAddr, SocketAddr, Vec<u8>)>,
+    pub(super) admitted: Vec<SocketAddr>,
+    pub(super) dialled: Option<SocketAddr>,
+}
+
+impl Attempt {
+    pub(super) fn new(
+        now: Instant,
+        is_controlling: bool,
+        local: &[LocalAddress],
+        rng: &mut ChaCha20Rng,
+    ) -> Self {
+        let (user, password) = (draw(rng), SecretBytes::new(draw(rng)));
+        let mut agent = IceAgent::with_hmac(credentials(user, &password), &Mac);
+        agent.set_controlling(is_controlling);
+        agent.set_control_tie_breaker(u64::from_be_bytes(draw(rng)));
+        agent.set_max_candidate_pairs(PAIRS_MAX);
+        agent.set_timing_advance(CHECK_PACE);
+        agent.set_initial_stun_rto(CHECK_AGAIN_AFTER);
+        agent.set_max_stun_rto(CHECK_EVERY_MAX);
+        let mut candidates = Vec::new();
+        for local in local {
+            let candidate = match local.kind {
+                CandidateKind::Host => Candidate::host(local.base, Protocol::Udp),
+                CandidateKind::ServerReflexive => {
+                    Candidate::server_reflexive(local.address, local.base, Protocol::Udp)
+                }
+            };
+            if let Ok(candidate) = candidate {
+                agent.add_local_candidate(candidate);
+                candidates.push(PathCandidate { kind: local.kind, place: local.address.into() });
+            }
+        }
+        candidates.truncate(PATH_CANDIDATES_MAX);
+        agent.handle_timeout(now);
+        Self {
+            number: u64::from_be_bytes(draw(rng)),
+            user,
+            password,
+            candidates,
+            agent,
+            peer: None,
+            has_offer: false,
+            is_controlling,
+            until: now + DIRECT_ATTEMPT_MAX,
+            allowance: 0,
+            answered: BTreeSet::new(),
+            sources: BTreeSet::new(),
+            nominated: None,
+            dialled: None,
+            admitted: BTreeSet::new(),
+        }
+    }
+
+    pub(super) fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// Returns this node's addresses for the peer.
+    pub(super) fn offer(&self) -> PathOffer {
+        let (password, candidates) = (self.password.clone(), self.candidates.clone());
+        PathOffer { attempt: self.number, user: self.user, password, candidates }
+    }
+
+    /// Returns `true` if the attempt is with this one of the peer, or with none yet.
+    pub(super) fn is_with(&mut self, peer: u64) -> bool {
+        *self.peer.get_or_insert(peer) == peer
+    }
+
+    /// Takes the peer's addresses, once. Returns `false` if they are of another attempt of the peer.
+    pub(super) fn take_offer(&mut self, now: Instant, offer: &PathOffer, refused: &mut u64) -> bool {
+        if !self.is_with(offer.attempt) {
+            return false;
+        }
+        if std::mem::replace(&mut self.has_offer, true) {
+            return true;
+        }
+        self.allowance = PATH_OFFER_BYTES;
+        self.agent.set_remote_credentials(credentials(offer.user, &offer.password));
+        for PathCandidate { kind, place } in &offer.candidates {
+            let address = SocketAddr::from(*place);
+            let candidate = match kind {
+                CandidateKind::Host => Candidate::host(address, Protocol::Udp),
+                CandidateKind::ServerReflexive => {
+                    Candidate::server_reflexive(address, address, Protocol::Udp)
+                }
+            };
+            match candidate {
+                Ok(candidate) if is_checkable(&address) => self.agent.add_remote_candidate(candidate),
+                _ => *refused += 1,
+            }
+        }
+        self.agent.handle_timeout(now);
+        true
+    }
+
+    /// Returns `true` if a check is of this attempt.
+    pub(super) fn accepts(&self, message: &StunMessage<'_>) -> bool {
+        self.agent.accepts_message(message)
+    }
+
+    pub(super) fn receive(
+        &mut self,
+        now: Instant,
+        to: SocketAddr,
+        from: SocketAddr,
+        (message, bytes): (StunMessage<'_>, usize),
+    ) {
+        if self.sources.len() >= SOURCES_MAX && !self.sources.contains(&from) {
+            return;
+        }
+        let is_answer = message.is_successful_binding_response();
+        let packet = StunPacket { proto: Protocol::Udp, source: from, destination: to, message };
+        if !self.agent.handle_packet(now, packet) {
+            return;
+        }
+        self.sources.insert(from);
+        // What comes may cause as much again, and only an address that answers is known to be of the peer.
+        self.allowance = self.allowance.saturating_add(bytes);
+        if is_answer {
+            self.answered.insert(from);
+        }
+    }
+
+    /// Returns `true` if a link at this address comes of this attempt.
+    pub(super) fn expects(&self, address: SocketAddr) -> bool {
+        self.dialled == Some(address) || self.admitted.contains(&address)
+    }
+
+    /// Lets the agent go on. `withheld` counts checks for which the offer does not pay.
+    pub(super) fn advance(&mut self, now: Instant, withheld: &mut u64) -> Progress {
+        let mut progress = Progress::default();
+        // The agent has one thing to do at a time.
+        for _ in 0..PAIRS_MAX {
+            if self.agent.poll_timeout().is_none_or(|at| at > now) {
+                break;
+            }
+            self.agent.handle_timeout(now);
+        }
+        while let Some(transmit) = self.agent.poll_transmit() {
+            let (from, to) = (transmit.source, transmit.destination);
+            let datagram = Vec::from(transmit.contents);
+            if !self.answered.contains(&to) {
+                let Some(left) = self.allowance.checked_sub(datagram.len()) else {
+                    *withheld += 1;
+                    continue;
+                };
+                self.allowance = left;
+            }
+            progress.sent.push((from, to, datagram));
+        }
+        while let Some(event) = self.agent.poll_event() {
+            match event {
+                IceAgentEvent::NominatedSend { destination, .. } => {
+                    let from = self.nominated.map_or(now + SETTLE, |(_, from)| from);
+                    self.nominated = Some((destination, from));
+                }
+                // Only the peer has the password, so its link may come from there.
+                IceAgentEvent::DiscoveredRecv { source, .. }
+                    if !self.is_controlling && self.admitted.insert(source) =>
+                {
+                    progress.admitted.push(source);
+                }
+                _ => {}
+            }
+        }
+        let nominated = self.nominated.filter(|(_, from)| self.is_controlling && *from <= now);
+        if let Some((address, _)) = nominated.filter(|_| self.dialled.is_none()) {
+            self.dialled = Some(address);
+            progress.dialled = Some(address);
+        }
+        progress
+    }
+
+    /// Returns why the attempt failed, if it did.
+    pub(super) fn over(&self, now: Instant) -> Option<NoDirectPath> {
+        let why = || match (self.has_offer, self.sources.is_empty()) {
+            (false, _) => NoDirectPath::Unanswered,
+            (true, true) => NoDirectPath::Blocked,
+            (true, false) => NoDirectPath::NoLink,
+        };
+        (self.until <= now).then(why)
+    }
+
+    pub(super) fn deadline(&mut self) -> Instant {
+        let dial = self.nominated.filter(|_| self.is_controlling && self.dialled.is_none());
+        let times = [self.agent.poll_timeout(), dial.map(|(_, from)| from)];
+        times.into_iter().flatten().fold(self.until, Instant::min)
+    }
+}
+
+impl fmt::Debug for Attempt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { number, peer, has_offer, allowance, nominated, .. } = self;
+        f.debug_struct("Attempt")
+            .field("number", number)
+            .field("peer", peer)
+            .field("has_offer", has_offer)
+            .field("allowance", allowance)
+            .field("nominated", nominated)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Returns the credentials of checks in text, as ICE has them.
+fn credentials(user: [u8; 4], password: &SecretBytes) -> IceCreds {
+    let hex = |bytes: &[u8]| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+    IceCreds { ufrag: hex(&user), pass: hex(password.expose()) }
+}
