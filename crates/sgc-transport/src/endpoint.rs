@@ -6,9 +6,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use sgc_wire::LaneToken;
+use tokio::sync::mpsc;
 
 use crate::any_link::AnyLink;
 use crate::credentials::CredentialStore;
+use crate::direct::{CheckDatagram, DirectHandle};
 use crate::dtls::{DtlsDialer, DtlsListener};
 use crate::error::{CloseReason, DialError, Refusal};
 use crate::framing::Greeting;
@@ -128,6 +130,16 @@ pub struct RefusedPeer {
     pub reason: Refusal,
 }
 
+/// Everything that comes of [`Dialer::open_direct`].
+pub struct DirectSockets {
+    /// Accept the links of expected peers, one for each address family.
+    pub listeners: Vec<Listener>,
+    /// Checks that arrive.
+    pub checks: mpsc::Receiver<CheckDatagram>,
+    /// The sockets.
+    pub handle: DirectHandle,
+}
+
 /// Dials links.
 pub struct Dialer {
     resolve_timeout: Duration,
@@ -152,6 +164,18 @@ impl Dialer {
         let dtls = DtlsDialer::new(credentials.clone(), options.clone(), Arc::clone(&metrics));
         let stream = StreamDialer::new(credentials, options, metrics);
         Self { resolve_timeout, quic, udp, dtls, stream }
+    }
+
+    /// Opens the sockets from which QUIC links are dialled for connectivity checks, and for links of peers that are
+    /// expected after them. Call it before the first dial. Needs a tokio runtime around it.
+    pub fn open_direct(&self) -> DirectSockets {
+        let (handle, checks) = DirectHandle::new();
+        let listen = |listener: QuicListener| Listener {
+            addr: ListenAddr::new(Scheme::Quic, listener.local_addr()),
+            kind: Kind::Quic(listener),
+        };
+        let listeners = self.quic.open_direct(&handle).into_iter().map(listen).collect();
+        DirectSockets { listeners, checks, handle }
     }
 
     /// Makes a link: looks the host up, tries its addresses, and returns once the far node has accepted. It tries once;

@@ -13,6 +13,7 @@ mod any_link;
 mod budget;
 mod congestion;
 mod credentials;
+mod direct;
 #[cfg(feature = "dtls")]
 mod dtls;
 #[cfg(not(feature = "dtls"))]
@@ -54,13 +55,14 @@ pub use any_link::AnyLink;
 pub use budget::{RECEIVE_BUDGET_BYTES, RECEIVE_WINDOW_BYTES_MIN, ReceiveBudget};
 pub use congestion::{Congestion, UnknownCongestion};
 pub use credentials::CredentialStore;
+pub use direct::{CheckDatagram, DirectHandle};
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub use dtls::HandshakeExercise;
 #[cfg(feature = "dtls")]
 #[doc(hidden)]
 pub use dtls::exercise_front;
-pub use endpoint::{Dialer, Listener, RefusedPeer};
+pub use endpoint::{Dialer, DirectSockets, Listener, RefusedPeer};
 pub use error::{
     CloseReason, DialError, FlowEnd, FlowError, LabelError, LinkError, PeerRefusal, ProtocolError, Refusal,
 };

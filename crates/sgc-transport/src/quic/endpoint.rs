@@ -6,7 +6,7 @@
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 use quinn::crypto::rustls::HandshakeData;
@@ -24,10 +24,12 @@ use super::places::Places;
 use super::{ControlRx, LinkInner, QuicLink, canonical, close, config, send_frame};
 use crate::budget::WindowLease;
 use crate::credentials::CredentialStore;
+use crate::direct::DirectHandle;
 use crate::dtls::{Claim, Mux};
 use crate::error::{CloseReason, DialError, LinkError, PeerRefusal, ProtocolError, Refusal};
 use crate::framing::{Greeting, Pieces};
 use crate::handshakes::{Entry, Handshakes, Holder};
+use crate::link::Link;
 use crate::metrics::TransportMetrics;
 use crate::options::{BulkLanes, LinkOptions};
 use crate::quinn_runtime::PromptRuntime;
@@ -47,6 +49,8 @@ pub(crate) struct QuicListener {
     endpoint: Endpoint,
     local: SocketAddr,
     acceptor: Arc<Acceptor>,
+    /// Decides who may make links, if this is the socket of links that were dialled.
+    guard: Option<DirectHandle>,
     handshakes: JoinSet<(SocketAddr, Result<QuicLink, Refusal>)>,
     places: Handshakes<Slot>,
 }
@@ -111,6 +115,19 @@ impl QuicListener {
         let endpoint_config = config::endpoint(flavor, credentials.identity().reset_key(), local.port());
         let runtime = Arc::new(PromptRuntime);
         let endpoint = Endpoint::new_with_abstract_socket(endpoint_config, Some(server), socket, runtime)?;
+        Ok(Self::over(endpoint, local, flavor, dtls, credentials, options, metrics))
+    }
+
+    /// Listens at an endpoint.
+    fn over(
+        endpoint: Endpoint,
+        local: SocketAddr,
+        flavor: Flavor,
+        dtls: Option<Arc<Mux>>,
+        credentials: CredentialStore,
+        options: LinkOptions,
+        metrics: Arc<TransportMetrics>,
+    ) -> Self {
         let places = Handshakes::new(&options);
         let acceptor = Arc::new(Acceptor {
             flavor,
@@ -120,7 +137,7 @@ impl QuicListener {
             dtls,
             bulk_lanes: AtomicBool::new(false),
         });
-        Ok(Self { endpoint, local, acceptor, handshakes: JoinSet::new(), places })
+        Self { endpoint, local, acceptor, guard: None, handshakes: JoinSet::new(), places }
     }
 
     pub(crate) fn local_addr(&self) -> SocketAddr {
@@ -136,7 +153,13 @@ impl QuicListener {
         loop {
             tokio::select! {
                 Some(done) = self.handshakes.join_next() => match done {
-                    Ok((_, Ok(link))) => return Some(Ok(link)),
+                    Ok((remote, Ok(link))) => match &self.guard {
+                        // Its checks were authentic at another address.
+                        Some(guard) if guard.expected(&remote) != Some(link.peer().node_id) => {
+                            link.close(CloseReason::Denied("no link is expected from here".into()));
+                        }
+                        _ => return Some(Ok(link)),
+                    },
                     Ok((remote, Err(refusal))) => return Some(Err((remote, refusal))),
                     Err(error) if error.is_cancelled() => {}
                     Err(error) => tracing::error!(%error, "a handshake ended abnormally"),
@@ -153,11 +176,21 @@ impl QuicListener {
 
     pub(crate) async fn close(&mut self, reason: &CloseReason) {
         self.handshakes.abort_all();
-        shut(&self.endpoint, reason).await;
+        // The dialer closes its own endpoints.
+        if self.guard.is_none() {
+            shut(&self.endpoint, reason).await;
+        }
     }
 
     /// Starts the handshake of a peer that has a place, and returns its refusal.
     fn admit(&mut self, incoming: Incoming) -> Option<(SocketAddr, Refusal)> {
+        let is_stranger =
+            |guard: &DirectHandle| guard.expected(&canonical(incoming.remote_address())).is_none();
+        if self.guard.as_ref().is_some_and(is_stranger) {
+            // Strangers learn nothing of the socket.
+            incoming.ignore();
+            return None;
+        }
         let LinkOptions { handshakes_max, handshakes_unvalidated_max, .. } = self.acceptor.options;
         let pending = self.places.pending();
         // A peer that cannot be asked for proof displaces nobody once all places are taken.
@@ -251,6 +284,8 @@ pub(crate) struct QuicDialer {
     options: LinkOptions,
     metrics: Arc<TransportMetrics>,
     endpoints: Mutex<Endpoints>,
+    /// Set if the sockets take checks and links, too.
+    direct: OnceLock<DirectHandle>,
 }
 
 #[derive(Default)]
@@ -266,7 +301,7 @@ impl QuicDialer {
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> Self {
-        Self { flavor, credentials, options, metrics, endpoints: Mutex::default() }
+        Self { flavor, credentials, options, metrics, endpoints: Mutex::default(), direct: OnceLock::new() }
     }
 
     /// Dials these addresses in this order; errors name `url`.
@@ -320,18 +355,45 @@ impl QuicDialer {
         if let Some(endpoint) = slot {
             return Ok(endpoint.clone());
         }
-        let (socket, _) = socket::bind(socket::any_like(remote), &self.options)?;
+        let socket = self.bind(remote)?;
         let config = config::endpoint(self.flavor, None, 0);
-        let endpoint = Endpoint::new_with_abstract_socket(config, None, socket, Arc::new(PromptRuntime))?;
+        let server =
+            self.direct.get().map(|_| config::listener(self.flavor, &self.credentials, &self.options));
+        let endpoint = Endpoint::new_with_abstract_socket(config, server, socket, Arc::new(PromptRuntime))?;
         Ok(slot.insert(endpoint).clone())
+    }
+
+    fn bind(&self, remote: SocketAddr) -> std::io::Result<Arc<dyn AsyncUdpSocket>> {
+        let (socket, _) = socket::bind(socket::any_like(remote), &self.options)?;
+        match self.direct.get() {
+            Some(direct) => direct.wrap(socket),
+            None => Ok(socket),
+        }
+    }
+
+    /// Opens the sockets of both families, as far as the system has them, for checks and for links of expected peers.
+    /// Returns the listeners of such links. Call it before the first dial.
+    pub(crate) fn open_direct(&self, direct: &DirectHandle) -> Vec<QuicListener> {
+        let _ = self.direct.set(direct.clone());
+        let families = [SocketAddr::from(([0, 0, 0, 0], 0)), SocketAddr::from(([0; 16], 0))];
+        let listen = |any| {
+            let endpoint = self.endpoint(any).ok()?;
+            let local = endpoint.local_addr().ok()?;
+            let (credentials, options) = (self.credentials.clone(), self.options.clone());
+            let metrics = Arc::clone(&self.metrics);
+            let mut listener =
+                QuicListener::over(endpoint, local, self.flavor, None, credentials, options, metrics);
+            listener.guard = Some(direct.clone());
+            Some(listener)
+        };
+        families.into_iter().filter_map(listen).collect()
     }
 
     /// Moves every link to a fresh socket, so that it leaves by the interface that the system would choose now.
     pub(crate) fn rebind(&self) -> std::io::Result<()> {
         let endpoints = lock(&self.endpoints);
         for endpoint in [&endpoints.v4, &endpoints.v6].into_iter().flatten() {
-            let (socket, _) = socket::bind(socket::any_like(endpoint.local_addr()?), &self.options)?;
-            endpoint.rebind_abstract(socket)?;
+            endpoint.rebind_abstract(self.bind(endpoint.local_addr()?)?)?;
         }
         Ok(())
     }
