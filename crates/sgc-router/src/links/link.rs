@@ -21,12 +21,30 @@ pub struct Neighbour {
     pub not_after: UnixMillis,
     /// Configured cost of the link, microseconds of round trip; `None` to measure it.
     pub cost: Option<u32>,
+    /// Whether the link was found without configuration, and where it leads.
+    pub direct: Option<DirectReach>,
+}
+
+/// Where a direct link leads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DirectReach {
+    /// To a network to which this node is attached, so its packets do not pass the uplink.
+    Near,
+    /// Elsewhere, through the same uplink as the links to routers.
+    Far,
 }
 
 impl From<&VerifiedPeer> for Neighbour {
     fn from(peer: &VerifiedPeer) -> Self {
         let VerifiedPeer { node_id, path, may_route, not_after, .. } = peer;
-        Self { node: *node_id, certs: path.clone(), may_route: *may_route, not_after: *not_after, cost: None }
+        Self {
+            node: *node_id,
+            certs: path.clone(),
+            may_route: *may_route,
+            not_after: *not_after,
+            cost: None,
+            direct: None,
+        }
     }
 }
 
@@ -45,6 +63,7 @@ pub(crate) struct Link {
     /// Its greeting; nothing else is accepted before it.
     hello: Option<Hello>,
     cost: Cost,
+    direct: Option<DirectReach>,
     /// The neighbour's wall clock, from its own report.
     clock: Option<PeerClock>,
     /// Time at which it was last told everything again because a clock was set.
@@ -53,7 +72,7 @@ pub(crate) struct Link {
 
 impl Link {
     pub(super) fn new(now: Now, neighbour: Neighbour) -> Self {
-        let Neighbour { node, certs, may_route, not_after, cost } = neighbour;
+        let Neighbour { node, certs, may_route, not_after, cost, direct } = neighbour;
         let mut state = Self {
             node,
             certs,
@@ -62,6 +81,7 @@ impl Link {
             expires: None,
             hello: None,
             cost: Cost::new(cost),
+            direct,
             clock: None,
             repeated: None,
         };
@@ -79,6 +99,7 @@ impl Link {
             expires: None,
             hello: Some(hello),
             cost: Cost::new(Some(0)),
+            direct: None,
             clock: None,
             repeated: None,
         }
@@ -97,6 +118,11 @@ impl Link {
     /// Returns the greeting.
     pub(crate) fn hello(&self) -> Option<Hello> {
         self.hello
+    }
+
+    /// Returns where the link leads, if it was found without configuration.
+    pub(crate) fn direct(&self) -> Option<DirectReach> {
+        self.direct
     }
 
     /// Returns the cost.

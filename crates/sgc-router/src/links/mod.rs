@@ -13,7 +13,7 @@ use sgc_wire::{Hello, NodeId, NodeTag, Now, PeerClock, UnixMillis};
 use smallvec::SmallVec;
 
 pub(crate) use self::link::Link;
-pub use self::link::Neighbour;
+pub use self::link::{DirectReach, Neighbour};
 use crate::link_id::LinkId;
 use crate::output::LinkClose;
 
@@ -66,6 +66,17 @@ impl Links {
     pub(crate) fn new(own: NodeId, hello: Hello) -> Self {
         let local = Link::local(own, hello);
         Self { own, links: BTreeMap::from([(LinkId::LOCAL, local)]), of_node: BTreeMap::new() }
+    }
+
+    /// Iterates over the direct links through the uplink.
+    pub(crate) fn far(&self) -> impl Iterator<Item = (LinkId, &NodeId)> {
+        let far = self.links.iter().filter(|(_, state)| state.direct() == Some(DirectReach::Far));
+        far.map(|(link, state)| (*link, state.node()))
+    }
+
+    /// Returns `true` if what goes over a link passes the uplink.
+    pub(crate) fn passes_uplink(&self, link: LinkId) -> bool {
+        link != LinkId::LOCAL && self.get(link).is_some_and(|state| state.direct() != Some(DirectReach::Near))
     }
 
     // ---- Links that come and go.
@@ -314,6 +325,7 @@ mod tests {
                 may_route: true,
                 not_after: UnixMillis(60_000),
                 cost: Some(1000 * link),
+                direct: None,
             };
             links.add(now, LinkId(link), neighbour);
         }

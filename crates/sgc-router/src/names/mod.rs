@@ -49,6 +49,8 @@ pub(crate) struct Names {
     heard: Heard,
     interests: Interests,
     questions: Questions,
+    /// Names of this node that are not told over a direct link, because more than one copy would pass the uplink.
+    withheld: BTreeSet<(LinkId, Name)>,
 }
 
 /// An announcement as its digest tells it.
@@ -105,6 +107,7 @@ impl Names {
             heard: Heard::default(),
             interests: Interests::default(),
             questions: Questions::new(config.incarnation, limits),
+            withheld: BTreeSet::new(),
         }
     }
 
@@ -420,6 +423,7 @@ impl Names {
         }
         self.questions.link_down(link);
         self.records.link_down(link);
+        self.withheld.retain(|(other, _)| *other != link);
     }
 
     /// Forgets every route over a link. Returns their names.

@@ -261,6 +261,17 @@ impl Names {
         }
     }
 
+    /// Withholds a name of this node from a direct link, or tells it there again.
+    pub(crate) fn withhold(&mut self, cx: &mut Context<'_>, link: LinkId, name: Name, is_withheld: bool) {
+        let is_news = match is_withheld {
+            true => self.withheld.insert((link, name)),
+            false => self.withheld.remove(&(link, name)),
+        };
+        if is_news {
+            self.tell_interested(cx, link, &[name]);
+        }
+    }
+
     /// Tells a neighbour the names of its interest again, because it did not believe the last records.
     pub(crate) fn tell_interested_again(&mut self, cx: &mut Context<'_>, link: LinkId) {
         self.interests.forget_told(link);
@@ -274,8 +285,8 @@ impl Names {
         let mut gone = Vec::new();
         for name in names {
             let Some(told) = self.interests.told(link, name) else { continue };
-            let next_hop =
-                self.next_hop(cx.network, name).filter(|(next_hop, _)| self.may_tell(*next_hop, link));
+            let is_told = |next_hop| self.may_tell(next_hop, link) && !self.withheld.contains(&(link, *name));
+            let next_hop = self.next_hop(cx.network, name).filter(|(next_hop, _)| is_told(*next_hop));
             let id = self.records.id(name);
             let news = match (told, next_hop.zip(id)) {
                 (None, None) => continue,

@@ -169,12 +169,33 @@ impl Router {
         }
     }
 
+    /// Lets one copy of a name of this node pass the uplink: while other nodes get it through the uplink as well, it is not
+    /// told over a direct link, and its sink there joins over a router.
+    fn spare_uplink(&mut self, name: Name) {
+        for link in self.links.far().map(|(link, _)| link).collect::<Vec<_>>() {
+            self.spare_uplink_at(link, name);
+        }
+    }
+
+    /// Does so for one link. Nothing happens unless it is a direct link through the uplink.
+    pub(super) fn spare_uplink_at(&mut self, link: LinkId, name: Name) {
+        let links = &self.links;
+        let Some((_, node)) = links.far().find(|(far, _)| *far == link) else { return };
+        let is_own = self.names.owner(&name).is_some_and(|owner| owner.node_id == self.config.node);
+        let passes = |link| links.passes_uplink(link);
+        let is_withheld = is_own && self.trees.serves_others(&name, link, node, passes);
+        self.names_part(|names, cx| names.withhold(cx, link, name, is_withheld));
+    }
+
     /// Carries out the effects of the trees.
     pub(super) fn perform(&mut self, effects: Effects) {
         for effect in effects {
             match effect {
                 Effect::Send { link, frame } => self.send(link, frame),
-                Effect::Forward { name, entry } => self.outputs.push(Output::Forward { name, entry }),
+                Effect::Forward { name, entry } => {
+                    self.outputs.push(Output::Forward { name, entry });
+                    self.spare_uplink(name);
+                }
             }
         }
     }

@@ -139,7 +139,10 @@ impl Router {
             Control::Hello(hello) => self.handle_hello(link, hello),
             Control::Advert { cost, signed } => self.handle_advert(link, cost, signed),
             Control::Unreach { names } => self.handle_unreach(link, &names),
-            Control::Interest { names } => self.names_part(|part, cx| part.add_interests(cx, link, &names)),
+            Control::Interest { names } => {
+                names.iter().for_each(|name| self.spare_uplink_at(link, *name));
+                self.names_part(|part, cx| part.add_interests(cx, link, &names));
+            }
             Control::Uninterest { names } => {
                 self.names_part(|part, cx| part.remove_interests(cx, link, &names));
             }
@@ -276,6 +279,11 @@ impl Router {
     /// Returns the minor version of the protocol with which the node of a link greeted; `None` before it did.
     pub fn minor(&self, link: LinkId) -> Option<u16> {
         Some(self.links.get(link)?.hello()?.minor)
+    }
+
+    /// Returns `true` if a branch of some name uses a link.
+    pub fn has_branches(&self, link: LinkId) -> bool {
+        self.trees.uses(link)
     }
 
     /// Returns the cost of a link, microseconds of round trip, and whether it seems dead.

@@ -90,6 +90,24 @@ impl Trees {
         self.trees.values().map(Tree::len).sum()
     }
 
+    /// Returns `true` if a branch ends at a link, on either side.
+    pub(crate) fn uses(&self, link: LinkId) -> bool {
+        self.of_link.contains_key(&link)
+    }
+
+    /// Returns `true` if data of a name goes over a link other than `link` that is wanted, to a sink of a node other than
+    /// `node`.
+    pub(crate) fn serves_others(
+        &self,
+        name: &Name,
+        link: LinkId,
+        node: &NodeId,
+        is_wanted: impl Fn(LinkId) -> bool,
+    ) -> bool {
+        let serves = |branch: &Branch| branch.carries_to_others(link, node) && is_wanted(branch.link());
+        self.trees.get(name).is_some_and(|tree| tree.iter().any(|(_, branch)| serves(branch)))
+    }
+
     /// Returns the time of the next timeout.
     pub(crate) fn next_deadline(&self) -> Option<Instant> {
         self.deadlines.first().map(|(at, ..)| *at)

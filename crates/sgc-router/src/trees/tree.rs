@@ -117,6 +117,11 @@ impl Branch {
         }
     }
 
+    /// Returns `true` if data goes over it to a sink of another node than `node`, over another link than `link`.
+    pub(super) fn carries_to_others(&self, link: LinkId, node: &NodeId) -> bool {
+        self.role == Role::Subscribe && self.carries() && self.link != link && self.peer != *node
+    }
+
     /// Waits for the sink's new request until then.
     pub(super) fn drain(&mut self, until: Instant) {
         self.stage = Stage::Draining { until };
