@@ -109,6 +109,7 @@ pub(crate) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         routers: [all("--router", &args.routers), all("--peer", &args.peers)].concat(),
         resolver: None,
         keep_alive: None,
+        direct: None,
         listen: all("--listen", &args.listen),
         peer_rate: None,
         mapping: None,

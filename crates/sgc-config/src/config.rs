@@ -77,6 +77,8 @@ pub struct Config {
     pub gateway: Option<GatewayConfig>,
     /// Server and pushes of metrics; `None` without `[metrics]`.
     pub metrics: Option<MetricsConfig>,
+    /// Nodes and groups of the fleet with which this node has direct links.
+    pub direct: Vec<Recipient>,
     /// Path of the status socket, if not the usual one.
     pub admin_socket: Option<PathBuf>,
     /// Nodes and groups of the fleet that may ask this node how it is doing; [`Config::observers`] has the usual ones

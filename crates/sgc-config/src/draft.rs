@@ -51,6 +51,8 @@ pub(crate) struct Draft {
     pub(crate) routers: Vec<WithOrigin<String>>,
     pub(crate) resolver: Option<WithOrigin<String>>,
     pub(crate) keep_alive: Option<WithOrigin<String>>,
+    /// The peers, or one of the words `auto` and `never` in place of a list.
+    pub(crate) direct: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(crate) listen: Vec<WithOrigin<String>>,
     pub(crate) peer_rate: Option<WithOrigin<String>>,
     pub(crate) mapping: Option<WithOrigin<String>>,

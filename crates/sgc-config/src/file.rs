@@ -101,6 +101,7 @@ impl FileReader<'_> {
             name: self.string(node.as_ref(), "name", "a string, such as \"arm-1\""),
             routers: self.routers(node.as_ref()),
             keep_alive: self.string(node.as_ref(), "keep_alive", "\"auto\", or a string such as \"5s\""),
+            direct: self.direct(node.as_ref()),
             resolver: self.string(node.as_ref(), "resolver", "a string, such as \"10.0.0.53\""),
             listen: self.flat_strings(
                 router.as_ref(),
@@ -559,6 +560,24 @@ impl FileReader<'_> {
             key,
             origin: self.origin(value.span()),
         })
+    }
+
+    /// Reads a list of peers, or a word for all or none.
+    fn direct(&mut self, node: Option<&Section<'_, '_>>) -> Option<WithOrigin<Vec<WithOrigin<String>>>> {
+        const KEY: &str = "direct";
+        const EXPECTED: &str = "\"auto\", \"never\", or an array of strings, such as [\"group:operators\"]";
+        let value = node?.entries.get(KEY)?;
+        let DeValue::String(_) = value.get_ref() else { return self.strings(node, KEY, EXPECTED) };
+        let everyone = || WithOrigin { value: "*".to_owned(), key: KEY, origin: self.origin(value.span()) };
+        let peers = match value.get_ref().as_str() {
+            Some("auto") => vec![everyone()],
+            Some("never") => Vec::new(),
+            _ => {
+                self.record_type(value, KEY, EXPECTED);
+                return None;
+            }
+        };
+        Some(WithOrigin { value: peers, key: KEY, origin: self.origin(value.span()) })
     }
 
     /// Reads strings, and arrays of strings with the URLs of one router.

@@ -98,9 +98,17 @@ impl Table {
                 "metrics",
                 "admin",
             ],
-            Self::Node => {
-                &["name", "routers", "resolver", "keep_alive", "identity", "state", "trust", "watch"]
-            }
+            Self::Node => &[
+                "name",
+                "routers",
+                "resolver",
+                "keep_alive",
+                "direct",
+                "identity",
+                "state",
+                "trust",
+                "watch",
+            ],
             Self::Ros => &[
                 "domain_id",
                 "discovery_range",

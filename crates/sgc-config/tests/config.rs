@@ -714,6 +714,20 @@ fn transports_are_set_by_a_table_of_their_own() {
 }
 
 #[test]
+fn direct_links_are_for_all_for_none_or_for_the_named() {
+    let direct = |text: &str| good(&format!("{NODE}node.direct = {text}")).direct;
+    let words = |peers: Vec<Recipient>| peers.iter().map(ToString::to_string).collect::<Vec<_>>();
+    assert_eq!(words(good(NODE).direct), ["*"]);
+    assert_eq!(words(direct("'auto'")), ["*"]);
+    assert!(direct("'never'").is_empty() && direct("[]").is_empty());
+    assert_eq!(words(direct("['group:operators', 'desk']")), ["group:operators", "desk"]);
+    for wrong in ["'always'", "true", "['partner:acme']", "['desk', 'desk']", "['']"] {
+        let said = said_about(&format!("node.direct = {wrong}"));
+        assert!(said.len() == 1 && said[0].contains("direct"), "{said:?}");
+    }
+}
+
+#[test]
 fn keep_alive_is_a_time_or_left_to_the_node() {
     let kept = |text: &str| good(&format!("{NODE}node.keep_alive = '{text}'")).keep_alive;
     assert_eq!(good(NODE).keep_alive, None);

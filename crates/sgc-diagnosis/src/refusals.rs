@@ -252,6 +252,26 @@ pub(crate) const CONTROL: &[Refusal] = &[
         "if it may, enroll it with `--group observers`, or name it in `observers` of [admin]",
     ),
     counted(
+        NodeDrop::DirectNotPermitted.key(),
+        "a node asks for a direct link that this one does not permit",
+        "if it may have one, name it in `direct` of [node]",
+    ),
+    counted(
+        NodeDrop::CandidateRefused.key(),
+        "a peer names an address to which no checks go: of its own host, of one network segment, or of a group",
+        "",
+    ),
+    counted(
+        NodeDrop::CheckWithheld.key(),
+        "no more checks went to addresses of a peer that do not answer",
+        "",
+    ),
+    counted(
+        NodeDrop::CheckOverflowed.key(),
+        "more checks of addresses arrived than could be handled",
+        "is the node busy, or under attack?",
+    ),
+    counted(
         OperationRefusal::Stale.key(),
         "an operator's request was of an earlier run; it is made again by itself",
         "",

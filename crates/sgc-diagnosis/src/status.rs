@@ -28,6 +28,7 @@ pub struct Status {
     pub links: Vec<Link>,
     /// Routers that the node dials or searches.
     pub routers: Vec<Router>,
+    not_direct: Vec<NotDirect>,
     /// Address of the host from which packets to the IPv6 internet leave.
     pub(crate) ipv6: Option<IpAddr>,
     /// Shares and uses.
@@ -45,6 +46,14 @@ pub struct Status {
     gateway: Option<Gateway>,
     metrics: Option<String>,
     otlp: Option<Pushes>,
+}
+
+/// A peer with which a node exchanges data over routers.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct NotDirect {
+    name: String,
+    why: String,
 }
 
 /// Pushes of metrics of a node. Its alerts have the present fault.
@@ -108,6 +117,8 @@ pub struct Link {
     pub(crate) local: Option<IpAddr>,
     /// Address from which the node comes, as the peer sees it.
     pub(crate) observed: Option<SocketAddr>,
+    /// The link was found without configuration.
+    pub direct: bool,
     /// Round trip, in microseconds.
     pub rtt_us: u64,
     cost: u32,
@@ -216,6 +227,11 @@ impl Status {
             &["peer", "remote", "round trip", "cost", "sent", "received", "dialled"],
             self.links.iter().map(Link::row).collect(),
         );
+        if !self.not_direct.is_empty() {
+            let rows =
+                self.not_direct.iter().map(|peer| vec![peer.name.as_str().into(), peer.why.as_str().into()]);
+            section("Over routers", &["peer", "why not direct"], rows.collect());
+        }
         let over: Vec<_> = self.links.iter().filter(|l| l.peer_slowed + l.peer_dropped > 0).collect();
         if !over.is_empty() {
             section(
@@ -325,7 +341,10 @@ impl Link {
             cost,
             output::bytes(self.sent_bytes).into(),
             output::bytes(self.received_bytes).into(),
-            self.url.as_deref().unwrap_or_default().into(),
+            match (self.direct, self.url.as_deref()) {
+                (true, _) => Toned::new(Tone::Good, "direct"),
+                (false, url) => url.unwrap_or_default().into(),
+            },
         ]
     }
 

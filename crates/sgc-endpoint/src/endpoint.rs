@@ -13,7 +13,8 @@ use rand_core::RngCore;
 use sgc_trust::{Identity, Policy, TrustAnchors, VerifiedPeer, verify_advert};
 use sgc_wire::{
     CatalogueSource, ClockWatch, Consumer, Control, Credentials, Name, NodeId, Now, OperationAnswer,
-    OperationRequest, Qos, RefuseReason, Report, ReportQuestion, SignedBody, SinkId, SourceId, TopicGrant,
+    OperationRequest, PathOffer, PathQuestion, Qos, RefuseReason, Report, ReportQuestion, SignedBody, SinkId,
+    SourceId, TopicGrant,
 };
 
 use crate::config::EndpointConfig;
@@ -250,6 +251,21 @@ impl Endpoint {
         }
     }
 
+    /// Answers [`crate::Event::PathAsked`].
+    pub fn answer_path(&mut self, now: Now, sink: SinkId, answer: Result<PathOffer, RefuseReason>) {
+        self.cx.set_now(now);
+        self.owner.answer_path(&mut self.cx, sink, answer);
+    }
+
+    /// Takes questions for the addresses of this node, or no more of them. Before the first call, none are taken.
+    pub fn offer_paths(&mut self, now: Now, is_offered: bool) {
+        self.cx.set_now(now);
+        match is_offered {
+            true => self.owner.offer_paths(&self.cx),
+            false => self.owner.withhold_paths(),
+        }
+    }
+
     /// Iterates over the members that ask this authority: sink, node, and signing request.
     pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
         self.owner.renewing()
@@ -341,6 +357,25 @@ impl Endpoint {
     pub fn ask_report(&mut self, now: Now, peer: NodeId, question: &ReportQuestion) -> Name {
         self.cx.set_now(now);
         self.joiner.ask_report(&mut self.cx, peer, question)
+    }
+
+    /// Asks a node of this fleet for its addresses, in place of an earlier question to it, until
+    /// [`Self::leave_path`]. A node that has no direct links, or of a version that cannot, does not advertise the name of
+    /// the question: then nothing happens.
+    pub fn ask_path(&mut self, now: Now, peer: NodeId, question: &PathQuestion) {
+        self.cx.set_now(now);
+        self.joiner.ask_path(&mut self.cx, peer, question);
+    }
+
+    /// Ends a question for a node's addresses.
+    pub fn leave_path(&mut self, now: Now, peer: &NodeId) {
+        self.cx.set_now(now);
+        self.joiner.leave_path(&mut self.cx, peer);
+    }
+
+    /// Iterates over the owners of the topics and services that this node joined and was granted, once for each of them.
+    pub fn data_owners(&self) -> impl Iterator<Item = &VerifiedPeer> {
+        self.joiner.data_owners()
     }
 
     /// Joins a name of `owner`: waits for it if necessary, and joins again whenever it has to.

@@ -8,8 +8,8 @@ use bytes::Bytes;
 use sgc_trust::{VerifiedAdvert, VerifiedPeer, verify_answer};
 use sgc_wire::{
     AnswerBody, Control, Decode, DescribedType, Encode as _, GrantContent, JoinBody, Name, NodeId,
-    OperationRequest, Recover, RefuseReason, RejectReason, ReportQuestion, SignedBody, SinkId, SourceId,
-    TYPES_PER_QUESTION_MAX,
+    OperationRequest, PathQuestion, Recover, RefuseReason, RejectReason, ReportQuestion, SignedBody, SinkId,
+    SourceId, TYPES_PER_QUESTION_MAX,
 };
 
 use crate::context::Context;
@@ -112,6 +112,27 @@ impl Joiner {
         self.leave(cx, &name);
         self.join(cx, name, peer, JoinKind::Report(question.to_bytes()));
         name
+    }
+
+    /// Asks a node of this fleet for its addresses, in place of an earlier question.
+    pub(crate) fn ask_path(&mut self, cx: &mut Context, peer: NodeId, question: &PathQuestion) {
+        let BlindName { name, .. } = BlindName::paths(&peer);
+        self.leave(cx, &name);
+        self.join(cx, name, peer, JoinKind::Path(question.to_bytes()));
+    }
+
+    /// Ends a question for a node's addresses.
+    pub(crate) fn leave_path(&mut self, cx: &mut Context, peer: &NodeId) {
+        self.leave(cx, &BlindName::paths(peer).name);
+    }
+
+    /// Iterates over the owners of the topics and services that this node joined.
+    pub(crate) fn data_owners(&self) -> impl Iterator<Item = &VerifiedPeer> {
+        let carries = |join: &&Join| {
+            matches!(join.kind(), JoinKind::Subscribe { .. } | JoinKind::Publish(_))
+                && join.granted_sink().is_some()
+        };
+        self.joins.values().filter(carries).filter_map(Join::reachable)
     }
 
     /// Joins a name of `owner`: waits for it if necessary, and joins again whenever it has to.
@@ -341,6 +362,10 @@ impl Joiner {
             (None, Some(JoinKind::Renew(_))) => cx.event(Event::RenewRefused { by }),
             (None, Some(JoinKind::Operate(_))) => cx.event(Event::OperationDenied { name, by }),
             (None, Some(JoinKind::Report(_))) => cx.event(Event::ReportRefused { name, by }),
+            (None, Some(JoinKind::Path(_))) => {
+                let owner = self.joins.get(&name).map(Join::owner);
+                owner.into_iter().for_each(|peer| cx.event(Event::PathRefused { peer, by }));
+            }
             // A missing description shows where it is needed.
             (None, Some(JoinKind::Types(_) | JoinKind::Consumers)) => {}
             (None, _) => cx.event(Event::Refused { name, by }),
@@ -375,6 +400,9 @@ impl Joiner {
             }
             (GrantContent::Report(report), Some(JoinKind::Report(_))) => {
                 cx.event(Event::Report { name, report });
+            }
+            (GrantContent::Path(offer), Some(JoinKind::Path(_))) => {
+                cx.event(Event::PathOffered { peer: owner, offer });
             }
             (GrantContent::Types(types), Some(JoinKind::Types(names))) => {
                 let asked = |t: &DescribedType| names.contains(&t.name);

@@ -87,6 +87,8 @@ pub enum JoinKind {
     Consumers,
     /// To get a node's report: the answer to an encoded [`sgc_wire::ReportQuestion`].
     Report(Bytes),
+    /// To get a node's addresses: the answer to an encoded [`sgc_wire::PathQuestion`].
+    Path(Bytes),
 }
 
 impl JoinKind {
@@ -95,7 +97,7 @@ impl JoinKind {
             Self::Subscribe { describe } => Request::Subscribe { describe: *describe },
             Self::Follow => Request::Subscribe { describe: false },
             Self::Publish(offer) => Request::Publish { offer: offer.clone() },
-            Self::Renew(what) | Self::Operate(what) | Self::Report(what) => {
+            Self::Renew(what) | Self::Operate(what) | Self::Report(what) | Self::Path(what) => {
                 Request::Ask { what: what.clone() }
             }
             Self::Types(names) => {
@@ -108,7 +110,7 @@ impl JoinKind {
 
     /// Returns whether one answer ends the join: no data flows, and no better route is looked for.
     pub(crate) fn is_question(&self) -> bool {
-        matches!(self, Self::Renew(_) | Self::Operate(_) | Self::Types(_) | Self::Report(_))
+        matches!(self, Self::Renew(_) | Self::Operate(_) | Self::Types(_) | Self::Report(_) | Self::Path(_))
     }
 }
 

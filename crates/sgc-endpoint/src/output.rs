@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use sgc_trust::{GrantError, SignedError};
 use sgc_wire::{
-    Catalogue, Consumer, Control, Credentials, DescribedType, Name, NodeId, OperationAnswer, Recover,
-    RefuseReason, Report, Role, SinkId, SourceId, TopicGrant,
+    Catalogue, Consumer, Control, Credentials, DescribedType, Name, NodeId, OperationAnswer, PathOffer,
+    Recover, RefuseReason, Report, Role, SinkId, SourceId, TopicGrant,
 };
 
 use crate::joins::{LostReason, RefusedBy};
@@ -134,6 +134,29 @@ pub enum Event {
     ReportRefused {
         /// The name of the question.
         name: Name,
+        /// The refusing node, with the reason.
+        by: RefusedBy,
+    },
+    /// A node of this fleet asks for the addresses of this one; [`crate::Endpoint::answer_path`] answers.
+    PathAsked {
+        /// The sink to answer.
+        sink: SinkId,
+        /// The node.
+        peer: sgc_trust::VerifiedPeer,
+        /// An encoded [`sgc_wire::PathQuestion`], not verified.
+        question: bytes::Bytes,
+    },
+    /// A node told its addresses.
+    PathOffered {
+        /// The node.
+        peer: NodeId,
+        /// Its addresses, and what checks of them need.
+        offer: PathOffer,
+    },
+    /// A node, or a router before it, refuses its addresses.
+    PathRefused {
+        /// The node.
+        peer: NodeId,
         /// The refusing node, with the reason.
         by: RefusedBy,
     },

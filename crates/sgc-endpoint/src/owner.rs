@@ -19,7 +19,7 @@ use bytes::Bytes;
 use sgc_trust::{Kem, Policy, TopicSecret, VerifiedPeer, name_of, verify_join};
 use sgc_wire::{
     CatalogueSource, Consumer, Credentials, Decode, GrantContent, JoinBody, Name, NodeId, OperationAnswer,
-    Qos, Recover, RefuseReason, Report, SignedBody, SinkId, SourceId, TopicGrant,
+    PathOffer, Qos, Recover, RefuseReason, Report, SignedBody, SinkId, SourceId, TopicGrant,
 };
 
 pub use self::adverts::{ADVERT_INTERVAL, ADVERTS_BURST};
@@ -48,6 +48,8 @@ const ENFORCE_EVERY: Duration = Duration::from_secs(20);
 const OPERATIONS_ASKED_MAX: usize = 64;
 /// Nodes that have a place at the name of this node's reports: observers are few, and leave once they are answered.
 const REPORTS_ASKED_MAX: usize = 64;
+/// Nodes that have a place at the name of this node's paths: they leave once they are answered.
+const PATHS_ASKED_MAX: usize = 256;
 
 /// The receiver of a request, by the name of the request.
 #[derive(Clone, Copy, Debug)]
@@ -58,6 +60,7 @@ enum Desk {
     Types,
     Consumers,
     Reports,
+    Paths,
     Share,
 }
 
@@ -81,6 +84,7 @@ pub(crate) struct Owner {
     types: TypeAnswers,
     consumers: ConsumerReports,
     reports: MemberRequests,
+    paths: MemberRequests,
     /// Time of the next look for expired certificates.
     enforce_at: Option<Instant>,
 }
@@ -101,6 +105,7 @@ impl Owner {
             types: TypeAnswers::new(&own),
             consumers: ConsumerReports::new(&own),
             reports: MemberRequests::new(None, REPORTS_ASKED_MAX),
+            paths: MemberRequests::new(None, PATHS_ASKED_MAX),
             enforce_at: None,
         };
         owner.advertise_all();
@@ -194,6 +199,7 @@ impl Owner {
         self.types.withdraw(&mut self.adverts);
         self.consumers.withdraw(&mut self.adverts);
         self.withhold_reports();
+        self.withhold_paths();
         self.enforce_at = None;
         self.catalogue.end_rest();
     }
@@ -258,6 +264,27 @@ impl Owner {
         self.reports.end().into_iter().for_each(|blind| self.adverts.withdraw(blind));
     }
 
+    /// Answers a node that asks for the addresses of this one.
+    pub(crate) fn answer_path(
+        &mut self,
+        cx: &mut Context,
+        sink: SinkId,
+        answer: Result<PathOffer, RefuseReason>,
+    ) {
+        self.paths.answer(cx, sink, answer.map(GrantContent::Path));
+    }
+
+    /// Takes questions for addresses from here on.
+    pub(crate) fn offer_paths(&mut self, cx: &Context) {
+        let name = BlindName::paths(&cx.identity().node_id());
+        self.paths.begin(name).into_iter().for_each(|blind| self.adverts.add(blind));
+    }
+
+    /// Takes no more questions for addresses.
+    pub(crate) fn withhold_paths(&mut self) {
+        self.paths.end().into_iter().for_each(|blind| self.adverts.withdraw(blind));
+    }
+
     /// Iterates over the members that ask this authority: sink, node, and signing request.
     pub(crate) fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
         self.renewals.iter()
@@ -304,7 +331,7 @@ impl Owner {
     pub(crate) fn advertise_all(&mut self) {
         let types = self.types.is_advertised().then(|| self.types.name().blind);
         let consumers = self.consumers.is_advertised().then(|| self.consumers.name().blind);
-        let asked = [&self.renewals, &self.operations, &self.reports];
+        let asked = [&self.renewals, &self.operations, &self.reports, &self.paths];
         let asked = asked.into_iter().filter_map(MemberRequests::blind);
         let fixed = self.catalogue.blinds().chain(asked).chain(types).chain(consumers);
         self.adverts.add_all(fixed.chain(self.shares.iter().map(Share::blind)));
@@ -364,6 +391,7 @@ impl Owner {
         self.types.enforce(cx);
         self.consumers.enforce(cx);
         self.reports.enforce(cx);
+        self.paths.enforce(cx);
     }
 
     pub(crate) fn handle_join(&mut self, cx: &mut Context, signed: &SignedBody) {
@@ -414,6 +442,12 @@ impl Owner {
                     cx.event(Event::ReportAsked { sink, peer, question });
                 }
             }
+            Some(Desk::Paths) => {
+                let request = self.paths.handle_request(cx, name, sink, asked);
+                if let Some(MemberRequest { peer, what: question }) = request {
+                    cx.event(Event::PathAsked { sink, peer, question });
+                }
+            }
             Some(Desk::Types) => self.types.handle_question(cx, &self.shares, sink, asked),
             Some(Desk::Consumers) => self.consumers.handle_question(cx, sink, asked),
             Some(Desk::Share) => {
@@ -435,6 +469,7 @@ impl Owner {
             Some(Desk::Renewals) => self.renewals.handle_leave(sink),
             Some(Desk::Operations) => self.operations.handle_leave(sink),
             Some(Desk::Reports) => self.reports.handle_leave(sink),
+            Some(Desk::Paths) => self.paths.handle_leave(sink),
             Some(Desk::Types) => self.types.handle_leave(sink),
             Some(Desk::Consumers) => self.consumers.handle_leave(sink),
             Some(Desk::Share) => {
@@ -470,6 +505,8 @@ impl Owner {
             Some(Desk::Operations)
         } else if self.reports.is_at(name) {
             Some(Desk::Reports)
+        } else if self.paths.is_at(name) {
+            Some(Desk::Paths)
         } else if self.types.name().name == *name {
             Some(Desk::Types)
         } else if self.consumers.name().name == *name {

@@ -10,10 +10,13 @@ use sgc_endpoint::{
     Limits, LostReason, Output, ShareError, ShareSpec, SignedKind,
 };
 use sgc_testkit::{Clock, Member, identity, invited};
-use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, name_of, operations_blind, seal_grant};
+use sgc_trust::{
+    Grantees, Identity, Policy, ReplyKey, Suite, name_of, operations_blind, paths_blind, seal_grant,
+};
 use sgc_wire::{
-    ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, Class, Control, Decode, GrantContent, JoinBody,
-    Metadata, Name, Qos, RefuseReason, Request, SecretBytes, SinkId, TopicGrant,
+    ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, CandidateKind, Class, Control, Decode, Encode as _,
+    GrantContent, JoinBody, Metadata, Name, PathCandidate, PathOffer, PathQuestion, Place, Qos, RefuseReason,
+    Request, SecretBytes, SinkId, TopicGrant,
 };
 
 /// An endpoint, and its outputs since the last call.
@@ -272,6 +275,55 @@ fn router_is_refused_what_everyone_in_the_fleet_may_have() {
         bench.frame(frame);
         assert_eq!(bench.answers(), [(SinkId([1; 16]), answer)]);
     }
+}
+
+/// Routers read questions, so these name no address. Answers are sealed.
+#[test]
+fn addresses_for_a_direct_path_travel_in_answers_alone() {
+    let mut bench = owner();
+    let name = name_of(&bench.identity.node_id(), &paths_blind(&bench.identity.node_id()));
+    let asks = |bench: &mut Bench, who: &Identity| {
+        let reply_key = ReplyKey::generate(sgc_trust::Kem::default());
+        let body = JoinBody {
+            name,
+            sink: SinkId([1; 16]),
+            request: Request::Ask { what: PathQuestion { attempt: 7 }.to_bytes() },
+            issued_at: bench.clock.now().unix,
+            chain: who.chain_bytes(),
+            reply_key: reply_key.public().clone(),
+        };
+        bench.frame(Control::Join { signed: who.sign_join(&body) });
+        reply_key
+    };
+    let desk = identity(&Member::new("desk"));
+    asks(&mut bench, &desk);
+    assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotShared))], "nothing is offered");
+    bench.endpoint.offer_paths(bench.clock.now(), true);
+    let stranger = identity(&Member { fleet: "other".into(), ..Member::new("desk") });
+    asks(&mut bench, &stranger);
+    assert_eq!(bench.answers().len(), 1);
+    assert!(bench.answers()[0].1.is_some(), "another fleet");
+    let reply_key = asks(&mut bench, &desk);
+    let Some(Event::PathAsked { sink, peer, question }) = bench.events.pop() else {
+        panic!("{:?}", bench.events)
+    };
+    assert_eq!((peer.node_id, question), (desk.node_id(), PathQuestion { attempt: 7 }.to_bytes()));
+    let place = Place { ip: [0xa5; 16], port: 40_123 };
+    let offer = PathOffer {
+        attempt: 9,
+        user: [1; 4],
+        password: SecretBytes::new([0x5a; 32]),
+        candidates: vec![PathCandidate { kind: CandidateKind::Host, place }],
+    };
+    bench.endpoint.answer_path(bench.clock.now(), sink, Ok(offer.clone()));
+    bench.drain();
+    let [Control::Answer { signed }] = &bench.sent[..] else { panic!("{:?}", bench.sent) };
+    let has = |secret: &[u8]| signed.body.windows(secret.len()).any(|part| part == secret);
+    assert!(!has(&[0xa5; 8]) && !has(&[0x5a; 8]), "a router reads it");
+    let body = AnswerBody::from_slice(&signed.body).unwrap();
+    let Answer::Grant { enc, sealed } = body.answer else { panic!("{:?}", body.answer) };
+    let opened = reply_key.open(&name, &sink, body.serial, &enc, &sealed).unwrap();
+    assert_eq!(opened, GrantContent::Path(offer));
 }
 
 /// Holders displace each other, and take no place that members have.

@@ -48,6 +48,14 @@ pub enum NodeDrop {
     OperationNotPermitted,
     /// A node that is no observer asked for a report.
     ReportNotPermitted,
+    /// A node that may have no direct link asked for the addresses of this one.
+    DirectNotPermitted,
+    /// A peer named an address to which no checks go.
+    CandidateRefused,
+    /// A check was not sent, because the peer's offer was too short for more.
+    CheckWithheld,
+    /// A check arrived while too many waited.
+    CheckOverflowed,
     /// An operation was requested again, and not carried out again.
     OperationRepeated,
     /// The local definition of a type differs from the announced one.
@@ -136,6 +144,10 @@ impl NodeDrop {
             Self::RenewalUnusable => "renewal_unusable",
             Self::OperationNotPermitted => "operation_not_permitted",
             Self::ReportNotPermitted => "report_not_permitted",
+            Self::DirectNotPermitted => "direct_not_permitted",
+            Self::CandidateRefused => "candidate_refused",
+            Self::CheckWithheld => "check_withheld",
+            Self::CheckOverflowed => "check_overflowed",
             Self::OperationRepeated => "operation_repeated",
             Self::TypeDiffers => "type_differs",
             Self::TypeRefused => "type_refused",

@@ -27,6 +27,8 @@ pub struct Status {
     pub links: Vec<LinkStatus>,
     /// The routers that the node looks for, and the state of each search.
     pub routers: Vec<RouterStatus>,
+    /// The peers with which data is exchanged over routers, although they may have a direct link.
+    pub not_direct: Vec<NotDirect>,
     /// The address of this host from which packets to the IPv6 internet leave; null without a route there.
     pub ipv6: Option<String>,
     /// Shares and uses, and the state of each.
@@ -54,6 +56,17 @@ pub struct Status {
     pub otlp: Option<PushStatus>,
 }
 
+/// A peer without a direct link.
+#[derive(Clone, Debug, Serialize)]
+pub struct NotDirect {
+    /// The node id of the peer.
+    pub peer: String,
+    /// The name of the peer, or the beginning of its node id if this node does not know the name.
+    pub name: String,
+    /// Why there is no direct link, in words.
+    pub why: String,
+}
+
 /// A link that is up.
 #[derive(Clone, Debug, Serialize)]
 pub struct LinkStatus {
@@ -73,6 +86,8 @@ pub struct LinkStatus {
     /// The address and port from which this node comes, as the peer sees it: another than `local` behind a NAT. Null if
     /// the peer dialled, or has not said it, as nodes of earlier versions do not.
     pub observed: Option<String>,
+    /// `true` for a direct link to a node with which this one exchanges data, found without configuration.
+    pub direct: bool,
     /// The key exchange, as TLS names it.
     pub kex: &'static str,
     /// The smoothed round-trip time, microseconds.

@@ -5,6 +5,7 @@
 
 mod alerts;
 mod consumers;
+mod direct;
 mod graph;
 mod links;
 mod operations;
@@ -49,6 +50,7 @@ use crate::control::graph::far_consumers::FarConsumers;
 use crate::control::graph::local_graph::LocalGraph;
 use crate::control::parts::certificates::{Certificates, Validity};
 use crate::control::parts::closings::Closings;
+use crate::control::parts::direct_links::{DirectEnds, DirectLinks};
 use crate::control::parts::forward_table::ForwardTable;
 use crate::control::parts::link_table::LinkTable;
 use crate::control::parts::network_ends::{NetworkEnds, OpenEnd};
@@ -97,6 +99,7 @@ pub(crate) struct Core<N: RosNetwork> {
     data: Arc<DataPlane>,
     inbox: Inbox,
     links: LinkTable,
+    direct: DirectLinks,
     forwards: ForwardTable,
     shares: Shares,
     closings: Closings,
@@ -202,6 +205,12 @@ pub(crate) struct CoreParts<N> {
     pub(crate) observers: Grantees,
     /// The rights that it tells them.
     pub(crate) rights: Arc<ReportRights>,
+    /// The sockets of direct links; `None` at a node that only routes.
+    pub(crate) direct: Option<DirectEnds>,
+    /// The peers that may have direct links.
+    pub(crate) direct_peers: Grantees,
+    /// Source of the passwords of checks.
+    pub(crate) rng: ChaCha20Rng,
 }
 
 impl<N: RosNetwork> Core<N> {
@@ -214,6 +223,7 @@ impl<N: RosNetwork> Core<N> {
         let shares = Shares::new(data.clone(), parts.alive.clone(), parts.epoch_messages_max);
         let ros_failures = Arc::<Drops>::default();
         let services = Services::new(ros_failures.clone(), shares.epoch_over().clone());
+        let own = parts.identity.node_id();
         let certificates = Certificates::new(
             parts.identity,
             parts.credentials,
@@ -231,6 +241,7 @@ impl<N: RosNetwork> Core<N> {
             data: data.clone(),
             inbox: Inbox::default(),
             links: LinkTable::new(parts.keep_alive_policy, parts.names.clone(), data.clone()),
+            direct: DirectLinks::new(own, parts.direct, Grantees::default(), parts.rng),
             forwards: ForwardTable::default(),
             shares,
             closings: Closings::default(),
@@ -269,6 +280,7 @@ impl<N: RosNetwork> Core<N> {
             local_taps: Vec::new(),
         };
         core.set_observers(parts.observers);
+        core.set_direct(parts.direct_peers);
         (core, requested)
     }
 
@@ -327,6 +339,9 @@ impl<N: RosNetwork> Core<N> {
                 self.address_observed(link, place);
             }
             CoreEvent::Frame { link, frame, room } => self.handle_frame(link, frame, room),
+            CoreEvent::Check(check) => self.check_arrived(&check),
+            CoreEvent::HostAddresses(addresses) => self.host_addresses(addresses),
+            CoreEvent::NotDialled(peer) => self.direct.not_dialled(Instant::now(), peer),
             CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
             CoreEvent::Malformed { link } => {
                 self.control_drops.count_from(NodeDrop::MalformedControl, link);
@@ -359,6 +374,7 @@ impl<N: RosNetwork> Core<N> {
                 message_keys,
                 member_names,
                 observers,
+                direct,
                 operators,
                 rights,
                 peer_rate,
@@ -370,6 +386,7 @@ impl<N: RosNetwork> Core<N> {
                 }
                 self.add_message_keys(message_keys);
                 self.set_observers(observers);
+                self.set_direct(direct);
                 if let Some(authority) = &mut self.authority {
                     authority.set_operators(operators);
                 }
@@ -441,6 +458,7 @@ impl<N: RosNetwork> Core<N> {
             None => {}
         }
         self.look_at_links(now.instant);
+        self.direct.handle_timeout(now.instant);
         self.router.handle_timeout(now);
         self.endpoint.handle_timeout(now);
         self.hold_shares(now.instant);
@@ -491,7 +509,7 @@ impl<N: RosNetwork> Core<N> {
                     output => self.router_output(output),
                 }
             };
-            let mut progressed = false;
+            let mut progressed = self.drain_direct();
             let endpoint = loop {
                 match self.endpoint.poll_output() {
                     EndpointOutput::Timeout(at) => break at,
@@ -516,6 +534,7 @@ impl<N: RosNetwork> Core<N> {
                     self.operations.deadline(),
                     self.inquiries.deadline(),
                     self.reports.deadline(),
+                    self.direct.deadline(),
                 ];
                 let own = own.into_iter().chain([self.reopening.deadline()]);
                 let all = [router, endpoint, routes, self.sinks.deadline(), rekey, self.services.deadline()];

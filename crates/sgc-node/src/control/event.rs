@@ -9,7 +9,7 @@ use sgc_ros::{
     ShownEndpoint, UseRule,
 };
 use sgc_router::LinkId;
-use sgc_transport::AnyLink;
+use sgc_transport::{AnyLink, CheckDatagram};
 use sgc_trust::{CrlError, Grantees, Identity, NodeName, TrustAnchors};
 use sgc_wire::{Control, Name, NodeId, Operation, OperationAnswer, Report, ReportQuestion, SourceId};
 use tokio::sync::oneshot;
@@ -29,6 +29,7 @@ use crate::data::sending::message_keys::MessageKeys;
 use crate::data::tap::{Tap, TapError, TapRequest};
 use crate::data::writer_queue::WriterQueue;
 use crate::link::control_tx::ControlTx;
+use crate::link::direct_address::HostAddress;
 use crate::metrics::readings::Readings;
 
 /// Events that may wait for the control task. Senders wait while it is full.
@@ -70,6 +71,12 @@ pub(crate) enum CoreEvent {
         /// Its room in the inbox.
         room: FrameRoom,
     },
+    /// A datagram that looks like a connectivity check arrived.
+    Check(CheckDatagram),
+    /// The addresses of this host changed, or are known for the first time.
+    HostAddresses(Vec<HostAddress>),
+    /// No direct link to this peer was made.
+    NotDialled(NodeId),
     /// A link has taken all control frames before a flush.
     Flushed {
         /// The link.
@@ -144,6 +151,8 @@ pub(crate) enum CoreEvent {
         member_names: MemberNames,
         /// The peers that may ask this node how it is doing.
         observers: Grantees,
+        /// The peers that may have direct links.
+        direct: Grantees,
         /// The peers that may change the fleet of which this node is the authority.
         operators: Grantees,
         /// The rate that each peer may send, bits a second; `None` for no limit.

@@ -1,6 +1,8 @@
 //! Links: connections to other nodes, from the first dial to the last frame.
 
 pub(crate) mod control_tx;
+pub(crate) mod direct;
+pub(crate) mod direct_address;
 pub(crate) mod in_use;
 pub(crate) mod inflow;
 pub(crate) mod lanes;

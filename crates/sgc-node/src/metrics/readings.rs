@@ -55,6 +55,8 @@ pub(crate) struct LinkReadings {
     pub(crate) dialled: u64,
     /// Links that peers dialled.
     pub(crate) accepted: u64,
+    /// Direct links of these.
+    pub(crate) direct: u64,
     /// Links whose peer does not answer.
     pub(crate) silent: u64,
     /// Links since the start.
@@ -62,7 +64,7 @@ pub(crate) struct LinkReadings {
     /// Bytes over all links since the start.
     pub(crate) sent_bytes: u64,
     pub(crate) received_bytes: u64,
-    /// The smoothed round trip of each link that this node dialled, by its URL.
+    /// The smoothed round trip of each link that this node dialled to a router, by its URL.
     pub(crate) round_trips: BTreeMap<String, Duration>,
 }
 

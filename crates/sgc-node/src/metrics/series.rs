@@ -181,6 +181,9 @@ pub const METRICS: &[Metric] = &[
     gauge("sgc_links_silent", &[], "Links that are up, but whose peer does not answer.", |s| {
         unlabelled(as_f64(s.readings.links.silent))
     }),
+    gauge("sgc_links_direct", &[], "Links that are up and lead directly to a peer, past the routers.", |s| {
+        unlabelled(as_f64(s.readings.links.direct))
+    }),
     counter(
         "sgc_links_established_total",
         &[],

@@ -14,7 +14,8 @@ use sgc_ros::{RosNetwork, Routes};
 use sgc_router::{Router, RouterConfig};
 use sgc_session::KeepAlivePolicy;
 use sgc_transport::{
-    BulkLanes, CredentialStore, Dialer, LinkOptions, ListenAddr, Listener, Scheme, TransportMetrics,
+    BulkLanes, CredentialStore, Dialer, DirectSockets, LinkOptions, ListenAddr, Listener, Scheme,
+    TransportMetrics,
 };
 use sgc_trust::{Identity, Suite, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
@@ -25,6 +26,7 @@ use crate::clock::now;
 use crate::control::core::{Core, CoreParts};
 use crate::control::event::{CoreEvent, INBOX_MAX};
 use crate::control::fleet::authority::Authority;
+use crate::control::parts::direct_links::DirectEnds;
 use crate::control::peers::peer_rate::PeerRates;
 use crate::control::settings::rules::Rules;
 use crate::data::sending::message_keys;
@@ -34,6 +36,7 @@ use crate::discovery::{Board, is_over_udp};
 use crate::gateway::access::{access_with, refused_tokens};
 use crate::gateway::certificate::gateway_expiry_warning;
 use crate::gateway::{Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, Sockets, listen_at};
+use crate::link::direct_address::{DIRECT_DIALS_MAX, DirectDial};
 use crate::local::network_slot::NetworkSlot;
 use crate::metrics::Metrics;
 use crate::node::error::NodeError;
@@ -86,6 +89,8 @@ pub(super) struct BuiltNode<N: RosNetwork> {
 pub(super) struct CoreChannels {
     pub(super) events: mpsc::Sender<CoreEvent>,
     pub(super) inbox: mpsc::Receiver<CoreEvent>,
+    /// Peers to dial without a router.
+    pub(super) direct_dials: mpsc::Receiver<DirectDial>,
     /// Requests of the control task's sinks.
     pub(super) requested: mpsc::Receiver<SinkRequest>,
     /// Notified when links have to be made again.
@@ -110,6 +115,8 @@ pub(super) async fn build<N: RosNetwork>(
     let (audit, audit_writer) = open_audit(&config, state.as_deref(), names.clone())?;
     let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());
     let sockets = LinkSockets::bind(&config, &identity, &rules, &anchors)?;
+    let (dials, direct_dials) = mpsc::channel(DIRECT_DIALS_MAX);
+    let direct = sockets.direct.as_ref().map(|direct| DirectEnds { handle: direct.handle.clone(), dials });
     let mut rng = system_rng()?;
     let machines = Machines::new(&config, &identity, &rules, anchors, network.is_some(), &mut rng);
     let again = open.as_ref().zip(config.ros.as_ref()).map(|(open, ros)| open_again(open, ros));
@@ -135,6 +142,9 @@ pub(super) async fn build<N: RosNetwork>(
         definitions,
         member_names: rules.members.clone(),
         observers: rules.observers.clone(),
+        direct,
+        direct_peers: rules.direct.clone(),
+        rng: ChaCha20Rng::from_rng(&mut rng),
         rights: rules.rights.clone(),
         board: board.clone(),
         keep_alive_policy: keep_alive_policy(&config),
@@ -163,7 +173,7 @@ pub(super) async fn build<N: RosNetwork>(
         names: names.clone(),
         storage,
     });
-    let channels = CoreChannels { events, inbox, requested, on_redial, all_ended };
+    let channels = CoreChannels { events, inbox, direct_dials, requested, on_redial, all_ended };
     Ok(BuiltNode {
         config,
         identity,
@@ -193,6 +203,8 @@ pub(super) struct LinkSockets {
     pub(super) dialer: Arc<Dialer>,
     /// Dials lanes. DSCP marks belong to sockets, so lanes with another mark need their own.
     pub(super) lane_dialer: Arc<Dialer>,
+    /// Of a node that has the fleet's secret, and so topics of its own.
+    pub(super) direct: Option<DirectSockets>,
     metrics: Arc<TransportMetrics>,
 }
 
@@ -216,11 +228,13 @@ impl LinkSockets {
         let listeners = config.listen.iter().map(bind).collect::<Result<Vec<_>, _>>()?;
         let dialer = |options| Arc::new(Dialer::new(credentials.clone(), options, metrics.clone()));
         let shared = dialer(options.clone());
+        let is_member = !identity.naming_secrets().is_empty();
+        let direct = is_member.then(|| shared.open_direct());
         let lane_dialer = match config.transport.lane_dscp {
             None => shared.clone(),
             marked => dialer(LinkOptions { dscp: marked, ..options }),
         };
-        Ok(Self { listeners, dialer: shared, lane_dialer, credentials, metrics })
+        Ok(Self { listeners, dialer: shared, lane_dialer, direct, credentials, metrics })
     }
 }
 

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use sgc_config::Config;
 use sgc_ros::RosNetwork;
-use sgc_transport::{Dialer, ListenAddr, Listener};
+use sgc_transport::{Dialer, DirectSockets, ListenAddr, Listener};
 use sgc_trust::Identity;
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
@@ -19,6 +19,7 @@ use crate::control::settings::file_watch::FileWatch;
 use crate::control::settings::reload::{Reloader, Running};
 use crate::discovery::{Claims, Dns, LinkKeeper, Searches, WantedRouters, WorkingUrls};
 use crate::gateway::Gateway;
+use crate::link::direct;
 use crate::link::lanes::LaneAdmission;
 use crate::link::links::{Admission, keep_accepting};
 use crate::link::roaming::Network;
@@ -100,9 +101,14 @@ pub(super) async fn spawn<N: RosNetwork>(
         lanes: lanes.clone(),
     };
     let accepting = sockets.listeners.into_iter().map(|listener| accept(listener, admission())).collect();
+    let mut accepting: Vec<_> = accepting;
+    let mut tasks = Vec::new();
+    if let Some(DirectSockets { listeners, checks, .. }) = sockets.direct {
+        accepting.extend(listeners.into_iter().map(|listener| begin_accepting(listener, admission())));
+        tasks.push(tokio::spawn(direct::serve(keeper.clone(), checks, channels.direct_dials)));
+    }
     let node_name = identity.node_name().to_string();
     let socket = admin_socket_path(&config, &node_name);
-    let mut tasks = Vec::new();
     tasks.push(tokio::spawn(reopening::watch(
         keeper.network.clone(),
         network.clone(),
@@ -207,6 +213,10 @@ async fn keep_fed(watchdog: Watchdog, events: mpsc::Sender<CoreEvent>) {
 
 fn accept(listener: Listener, admission: Admission) -> (JoinHandle<()>, oneshot::Sender<()>) {
     info!("listening on {}", listener.local());
+    begin_accepting(listener, admission)
+}
+
+fn begin_accepting(listener: Listener, admission: Admission) -> (JoinHandle<()>, oneshot::Sender<()>) {
     let (stop, stopped) = oneshot::channel();
     (tokio::spawn(keep_accepting(listener, admission, stopped)), stop)
 }

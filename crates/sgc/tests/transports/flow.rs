@@ -24,6 +24,9 @@ pub(crate) const TOPICS: [Topic; 2] = [
     Topic { name: "/video", reliable: false, period: Duration::from_millis(50), bytes: 500 },
 ];
 
+/// A topic whose publisher comes late.
+pub(crate) const LATE: Topic = Topic { name: "/late", ..TOPICS[0] };
+
 impl Topic {
     fn spec(&self) -> EndpointSpec {
         let (reliability, history) = if self.reliable {
@@ -58,6 +61,19 @@ pub(crate) struct Flow {
     talker: Option<JoinHandle<()>>,
     _reader: FakeReader,
     _net: FakeRos,
+}
+
+/// A subscriber that counts.
+pub(crate) struct Ears {
+    count: Arc<AtomicU64>,
+    _reader: FakeReader,
+    _net: FakeRos,
+}
+
+impl Ears {
+    pub(crate) fn count(&self) -> u64 {
+        self.count.load(SeqCst)
+    }
 }
 
 /// The result of a flow around an event.
@@ -102,6 +118,18 @@ impl Flow {
             }
         });
         Self { topic, exchange, talker: Some(talker), _reader: reader, _net: net }
+    }
+
+    /// Returns a further subscriber of the topic, on another local network.
+    pub(crate) fn listen(&self, domain: &FakeDomain) -> Ears {
+        let net = domain.join(false);
+        let count = Arc::<AtomicU64>::default();
+        let hears = Arc::clone(&count);
+        let handler = Box::new(move |_: Sample| {
+            hears.fetch_add(1, SeqCst);
+        });
+        let reader = net.create_reader(&self.topic.spec(), handler).unwrap();
+        Ears { count, _reader: reader, _net: net }
     }
 
     /// Returns the number of the last sent message.

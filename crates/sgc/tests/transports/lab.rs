@@ -48,6 +48,12 @@ pub(crate) enum Nat {
     FullCone,
     /// Draws each port at random from this range and admits only contacted senders.
     RandomPort(&'static str),
+    /// Keeps ports and admits only contacted senders.
+    PortRestricted,
+    /// No NAT, and a firewall that admits only contacted senders.
+    Firewall,
+    /// No NAT and no firewall.
+    Public,
 }
 
 /// Ranges for a NAT that forgets.
@@ -96,9 +102,11 @@ impl Lab {
         lab.desk.ip(&["route", "add", "default", "via", "10.2.0.1"]).unwrap();
         lab.near.ip(&["route", "add", "default", "via", "10.10.1.1"]).unwrap();
         lab.far.ip(&["route", "add", "default", "via", "10.10.2.1"]).unwrap();
+        let forward = || fs::write("/proc/sys/net/ipv4/ip_forward", "1").unwrap();
+        lab.cloud.within(forward).unwrap();
         for site in [&lab.near, &lab.far] {
             site.within(|| {
-                fs::write("/proc/sys/net/ipv4/ip_forward", "1").unwrap();
+                forward();
                 // Packets with a foreign source address are dropped, as providers do.
                 fs::write("/proc/sys/net/ipv4/conf/all/rp_filter", "1").unwrap();
             })
@@ -141,7 +149,25 @@ impl Lab {
         self.robot.ip(&["route", "replace", "default", "via", gateway]).unwrap();
     }
 
+    /// Replaces the NAT of the desk's network.
+    pub(crate) fn set_far_nat(&self, nat: Nat) {
+        self.set_nat(&self.far, nat, "10.2.0.2");
+    }
+
     fn set_nat(&self, site: &Namespace, nat: Nat, inside: &str) {
+        // The world has no route to addresses behind a NAT.
+        let (network, gateway) = match inside {
+            "10.2.0.2" => ("10.2.0.0/24", "10.10.2.2"),
+            _ => ("10.1.0.0/24", "10.10.1.2"),
+        };
+        match nat {
+            Nat::Firewall | Nat::Public => {
+                self.cloud.ip(&["route", "replace", network, "via", gateway]).unwrap();
+            }
+            Nat::FullCone | Nat::RandomPort(_) | Nat::PortRestricted => {
+                let _ = self.cloud.ip(&["route", "del", network]);
+            }
+        }
         let rules = match nat {
             Nat::FullCone => format!(
                 "chain out {{ type nat hook postrouting priority 100; oifname \"wan\" masquerade; }}\n\
@@ -151,6 +177,16 @@ impl Lab {
                 "chain out {{ type nat hook postrouting priority 100; \
                  oifname \"wan\" ip protocol {{ tcp, udp }} masquerade to :{range} random; }}"
             ),
+            // A router of a home drops what nobody asked for, so that it does not take the port of a later mapping.
+            Nat::PortRestricted => {
+                "chain out { type nat hook postrouting priority 100; oifname \"wan\" masquerade; }\n\
+                 chain own { type filter hook input priority 0; iifname \"wan\" ct state new drop; }"
+                    .to_owned()
+            }
+            Nat::Firewall => "chain through { type filter hook forward priority 0; \
+                 iifname \"wan\" ct state new drop; }"
+                .to_owned(),
+            Nat::Public => String::new(),
         };
         self.load_rules(site, "nat", &format!("flush ruleset\ntable ip nat {{\n{rules}\n}}\n"));
     }
@@ -169,6 +205,17 @@ impl Lab {
     pub(crate) fn block_udp(&self) {
         let rule = "chain through { type filter hook forward priority 0; ip protocol udp drop; }";
         self.load_rules(&self.near, "block", &format!("table ip block {{\n{rule}\n}}\n"));
+    }
+
+    /// Drops what goes from one site to the other. Both still reach the router.
+    pub(crate) fn cut_between_sites(&self) {
+        let rules = "chain through { type filter hook forward priority 0; drop; }";
+        self.load_rules(&self.cloud, "cut", &format!("flush ruleset\ntable ip cut {{\n{rules}\n}}\n"));
+    }
+
+    /// Lets it pass again.
+    pub(crate) fn join_sites(&self) {
+        self.load_rules(&self.cloud, "cut", "flush ruleset\n");
     }
 
     fn load_rules(&self, site: &Namespace, name: &str, rules: &str) {

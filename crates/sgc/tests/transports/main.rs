@@ -10,6 +10,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod direct;
 mod flow;
 mod lab;
 mod node;
@@ -21,7 +22,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use flow::{Flow, TOPICS};
+use flow::{Flow, LATE, TOPICS};
 use lab::{Lab, Lan, Nat, RANGES, schemes};
 use node::Node;
 use sgc_sync::lock;
@@ -52,25 +53,38 @@ struct Pair {
     scheme: &'static str,
     flows: Vec<Flow>,
     robot: Node,
-    _desk: Node,
+    desk: Node,
+    near: FakeDomain,
+    far: FakeDomain,
 }
 
 impl Pair {
     /// The robot dials `routers`, the desk the router by `scheme`.
     fn start(lab: &Lab, scheme: &'static str, routers: &[&str]) -> Self {
-        let [near, far] = [FakeDomain::default(), FakeDomain::default()];
         let (robot, desk) = (format!("robot-{scheme}"), format!("desk-{scheme}"));
         let [mut shares, mut uses] = ["[ros]\ndomain_id = 0\n".to_owned(), String::new()];
-        for topic in TOPICS {
-            shares += &format!("[[share]]\ntopic = \"{}\"\nto = [\"{desk}\"]\n", topic.name);
+        for topic in TOPICS.into_iter().chain([LATE]) {
+            shares += &format!("[[share]]\ntopic = \"{}\"\nto = [\"{desk}\", \"desk-2\"]\n", topic.name);
             uses += &format!("[[use]]\nfrom = \"{robot}\"\ntopic = \"{}\"\n", topic.name);
         }
-        let desk_file = lab.write_config(&desk, &[&lab.url(scheme)], &uses);
-        let robot_file = lab.write_config(&robot, routers, &shares);
-        let desk = Node::start(&lab.desk, &desk_file, lab.enroll(&desk, false), Some(&far));
-        let robot = Node::start(&lab.robot, &robot_file, lab.enroll(&robot, false), Some(&near));
+        Self::with(lab, scheme, [&robot, &desk], [&shares, &uses], routers)
+    }
+
+    /// Starts both with these names and the rest of their configurations.
+    fn with(
+        lab: &Lab,
+        scheme: &'static str,
+        [robot, desk]: [&str; 2],
+        [shares, uses]: [&str; 2],
+        routers: &[&str],
+    ) -> Self {
+        let [near, far] = [FakeDomain::default(), FakeDomain::default()];
+        let desk_file = lab.write_config(desk, &[&lab.url(scheme)], uses);
+        let robot_file = lab.write_config(robot, routers, shares);
+        let desk = Node::start(&lab.desk, &desk_file, lab.enroll(desk, false), Some(&far));
+        let robot = Node::start(&lab.robot, &robot_file, lab.enroll(robot, false), Some(&near));
         let flows = TOPICS.into_iter().map(|topic| Flow::start(topic, &near, &far)).collect();
-        Self { scheme, flows, robot, _desk: desk }
+        Self { scheme, flows, robot, desk, near, far }
     }
 
     fn wait_for(&self, what: &str, after: impl Fn(&Flow) -> u64) {

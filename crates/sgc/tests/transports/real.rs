@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 use std::thread::sleep;
 
+use rustix::process::Signal;
 use serde_json::{Value, json};
 use sgc_testkit::netsim::Namespace;
 
@@ -134,5 +135,43 @@ fn a_robot_learns_its_nat_from_its_routers() {
                 seen().iter().all(|address| (30_000..40_000).contains(&address.port()))
             });
         }
+    }
+}
+
+/// The other node still has the link to the run that was killed. It must not keep the next run from having one.
+#[test]
+fn node_that_was_killed_has_its_direct_link_again_at_once() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(Lan::Cable, Nat::PortRestricted);
+    for (node, router) in [("cloud", true), ("robot", false), ("desk", false)] {
+        lab.enroll(node, router);
+    }
+    let ros = "[ros]\ndomain_id = 0\ndiscovery_range = \"localhost\"\nstatic_peers = []\n";
+    let topic = "topic = \"/chatter\"\n";
+    let url = lab.url("quic");
+    lab.router_config();
+    lab.write_config("robot", &[&url], &format!("{ros}[[share]]\n{topic}to = [\"desk\"]\n"));
+    lab.write_config("desk", &[&url], &format!("{ros}[[use]]\n{topic}from = \"robot\"\n"));
+    let _cloud = run(&lab, &lab.cloud, "cloud");
+    let mut nodes = [Some(run(&lab, &lab.robot, "robot")), Some(run(&lab, &lab.desk, "desk"))];
+    let _talker = peer(&lab, &lab.robot, "pub", "cyclone", &["--rate", "50", "--verbose"]);
+    let mut listener = peer(&lab, &lab.desk, "sub", "fastdds", &["--verbose"]);
+    let made = |node: &str| {
+        let log = std::fs::read_to_string(lab.path(&format!("{node}.log"))).unwrap();
+        log.matches("direct link is up").count()
+    };
+    eventually("a direct link", || made("robot") == 1 && made("desk") == 1);
+    for (n, (node, namespace)) in [("robot", &lab.robot), ("desk", &lab.desk)].into_iter().enumerate() {
+        nodes[n].take().unwrap().end(Signal::KILL);
+        nodes[n] = Some(run(&lab, namespace, node));
+        eventually("a direct link to the next run", || made("robot") == n + 2 && made("desk") == n + 2);
+        listener.events.try_iter().for_each(drop);
+        listener.wait("a message", |event| event["event"] == "received");
+        // Links that end at once would be made again and again.
+        sleep(3 * CALM);
+        assert_eq!((made("robot"), made("desk")), (n + 2, n + 2), "after the restart of {node}");
     }
 }

@@ -31,14 +31,22 @@ impl<N: RosNetwork> Core<N> {
     ) {
         let set = url.as_deref().and_then(|url| url.parse::<LinkUrl>().ok()).and_then(|url| url.cost_ms);
         let cost = set.map(|ms| ms.saturating_mul(1000));
-        let neighbour = Neighbour { cost, ..Neighbour::from(link.peer()) };
         let remote = link.remote();
         self.hear_of(link.peer());
         let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
         self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
         let rtt = link.stats().rtt;
         let id = self.links.add(Instant::now(), link.clone(), url, control);
-        info!(link = id.0, %remote, peer = self.names.called(&link.peer().node_id), "link is up");
+        let direct = self.direct.link_up(Instant::now(), id, link.peer().node_id, remote);
+        let what = match direct {
+            Some(_) => {
+                self.links.set_direct(id);
+                "direct link is up"
+            }
+            None => "link is up",
+        };
+        info!(link = id.0, %remote, peer = self.names.called(&link.peer().node_id), "{what}");
+        let neighbour = Neighbour { cost, direct, ..Neighbour::from(link.peer()) };
         self.control_drops.link_up(id);
         self.data.drops().link_up(id);
         let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
@@ -57,6 +65,7 @@ impl<N: RosNetwork> Core<N> {
     /// for it; `end` tells how the link ended.
     pub(super) fn link_down(&mut self, id: LinkId, in_use: Option<String>, end: Option<String>) {
         self.router.handle_link_down(now(), id);
+        self.direct.link_down(Instant::now(), id);
         self.control_drops.link_down(id);
         self.data.drops().link_down(id);
         if let Some(EndedLink { node, remote, closed_for }) = self.links.remove(id) {
@@ -78,19 +87,29 @@ impl<N: RosNetwork> Core<N> {
         let now = now();
         for LinkMeasurement { link, rtt, is_silent } in self.links.look(at) {
             self.router.handle_link_quality(now, link, rtt, is_silent);
-            if self.router.minor(link) >= Some(MINOR_OBSERVED_ADDRESS) {
-                self.links.tell_address(link);
-            }
+            self.tell_address(link);
         }
+        self.look_at_direct(at);
         self.warn_of_owners_here();
         self.warn_of_misspelt(now.instant);
     }
 
+    /// Tells the peer of a link its address, if its version knows the frame.
+    fn tell_address(&mut self, link: LinkId) {
+        if self.router.minor(link) >= Some(MINOR_OBSERVED_ADDRESS) {
+            self.links.tell_address(link);
+        }
+    }
+
     /// Passes a control frame to the router.
     pub(super) fn handle_frame(&mut self, link: LinkId, frame: Control, room: FrameRoom) {
-        let tells_time = matches!(frame, Control::Clock { .. });
+        let (tells_time, greets) =
+            (matches!(frame, Control::Clock { .. }), matches!(frame, Control::Hello(_)));
         self.router.handle_frame(now(), link, frame);
         drop(room);
+        if greets {
+            self.tell_address(link);
+        }
         if tells_time {
             self.compare_clocks(link);
         }
@@ -101,6 +120,7 @@ impl<N: RosNetwork> Core<N> {
         let address = SocketAddr::from(place);
         if self.links.observe_address(link, address) {
             debug!(link = link.0, %address, "the peer sees this node at an address");
+            self.reflexive_changed();
         } else {
             self.control_drops.count_from(&DropReason::Unknown { what: "address" }, link);
         }

@@ -117,6 +117,9 @@ impl<N: RosNetwork> Core<N> {
             Event::ReportAsked { sink, peer, question } => self.report_asked(sink, &peer, &question),
             Event::Report { name, report } => self.take_report(name, &report),
             Event::ReportRefused { name, by } => self.report_refused(name, by),
+            Event::PathAsked { sink, peer, question } => self.path_asked(sink, &peer, &question),
+            Event::PathOffered { peer, offer } => self.path_offered(peer, &offer),
+            Event::PathRefused { peer, .. } => self.path_refused(peer),
             Event::OperationAnswered { name, answer } => self.operation_answered(name, answer),
             Event::OperationDenied { name, by } => self.operation_denied(name, by),
             Event::Renewed { credentials } => self.take_credentials(credentials),
@@ -250,6 +253,9 @@ impl<N: RosNetwork> Core<N> {
             | Event::ReportAsked { .. }
             | Event::Report { .. }
             | Event::ReportRefused { .. }
+            | Event::PathAsked { .. }
+            | Event::PathOffered { .. }
+            | Event::PathRefused { .. }
             | Event::Rekeyed { .. }
             | Event::OwnGrant { .. }
             | Event::Recover(_)

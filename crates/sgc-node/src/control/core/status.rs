@@ -5,9 +5,11 @@ use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
 use sgc_ros::{RosNetwork, RouteStatus, Routes};
 use sgc_router::LinkId;
+use sgc_session::NoDirectPath;
+use sgc_wire::NodeId;
 
 use super::Core;
-use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
+use crate::admin::status::{LinkStatus, NameStatus, NotDirect, RouteLine, RouterLine, Status};
 use crate::control::parts::link_table::LinkEntry;
 use crate::data::stats::CountDrops;
 use crate::drops::NodeDrop;
@@ -29,6 +31,7 @@ impl<N: RosNetwork> Core<N> {
             uptime_s: self.started.elapsed().as_secs(),
             links: links.collect(),
             routers: self.board.snapshot(),
+            not_direct: self.direct.relayed().map(|(peer, why)| self.not_direct(&peer, why)).collect(),
             ipv6: source_towards(IPV6_INTERNET).map(|ip| ip.to_string()),
             routes: self.routes.iter().flat_map(Routes::status).map(|route| self.route_line(route)).collect(),
             alerts: self.alerts(),
@@ -78,11 +81,16 @@ impl<N: RosNetwork> Core<N> {
             LinkReadings { sent_bytes, received_bytes, established, ..LinkReadings::default() };
         for (id, entry) in self.links.iter() {
             let (_, is_silent) = self.router.link_cost(id).unwrap_or_default();
+            let is_direct = self.direct.is_direct(id);
             readings.silent += u64::from(is_silent);
+            readings.direct += u64::from(is_direct);
             match entry.url() {
                 Some(url) => {
                     readings.dialled += 1;
-                    readings.round_trips.insert(url.to_owned(), entry.stats().rtt);
+                    // Peers announce the addresses of direct links, and series are not for each of these.
+                    if !is_direct {
+                        readings.round_trips.insert(url.to_owned(), entry.stats().rtt);
+                    }
                 }
                 None => readings.accepted += 1,
             }
@@ -100,6 +108,10 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
+    fn not_direct(&self, peer: &NodeId, why: NoDirectPath) -> NotDirect {
+        NotDirect { peer: peer.to_string(), name: self.names.called(peer), why: why.to_string() }
+    }
+
     fn link_status(&self, id: LinkId, entry: &LinkEntry) -> LinkStatus {
         let (stats, (lanes, bulk_lanes)) = (entry.stats(), entry.lanes());
         let (cost, silent) = self.router.link_cost(id).unwrap_or_default();
@@ -112,6 +124,7 @@ impl<N: RosNetwork> Core<N> {
             url: entry.url().map(str::to_owned),
             local: entry.url().and_then(|_| source_towards(entry.remote())).map(|ip| ip.to_string()),
             observed: entry.observed().map(|address| address.to_string()),
+            direct: self.direct.is_direct(id),
             kex: stats.key_exchange.label(),
             rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
             cost,
@@ -154,12 +167,16 @@ impl<N: RosNetwork> Core<N> {
     /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some
     /// kinds.
     pub(super) fn all_drops(&self) -> BTreeMap<String, u64> {
-        let audit = [
+        let (withheld, candidates, overflowed) = self.direct.refusals();
+        let kept = [
+            (NodeDrop::CheckWithheld, withheld),
+            (NodeDrop::CandidateRefused, candidates),
+            (NodeDrop::CheckOverflowed, overflowed),
             (NodeDrop::AuditLost, self.audit.lost_total()),
             (NodeDrop::AuditSummedUp, self.audit.summed_up_total()),
         ];
-        let audit = audit.into_iter().filter(|(_, n)| *n > 0).map(|(kind, n)| (kind.key().to_owned(), n));
-        let mut all: BTreeMap<String, u64> = audit.collect();
+        let kept = kept.into_iter().filter(|(_, n)| *n > 0).map(|(kind, n)| (kind.key().to_owned(), n));
+        let mut all: BTreeMap<String, u64> = kept.collect();
         for counts in [
             self.control_drops.snapshot_by_name(&self.names),
             self.data.drops().snapshot(),

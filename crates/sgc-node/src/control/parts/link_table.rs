@@ -98,6 +98,13 @@ impl LinkTable {
         id
     }
 
+    /// Notes that a link is direct.
+    pub(crate) fn set_direct(&mut self, id: LinkId) {
+        if let Some(entry) = self.links.get_mut(&id) {
+            entry.keep_alive.set_direct();
+        }
+    }
+
     /// Removes a link and closes its queues.
     pub(crate) fn remove(&mut self, id: LinkId) -> Option<EndedLink> {
         let entry = self.links.remove(&id)?;

@@ -6,6 +6,7 @@
 //! - [`link_table`] queues frames, probes peers, starts the senders of packets, and closes links.
 //! - [`certificates`] has the identity and the revocation lists saved, and passes credentials to links, to the gateway
 //!   and to dialling tasks.
+//! - [`direct_links`] sends checks, and has peers dialled.
 //! - [`publishers`] creates signing keys.
 //! - [`shares`] and [`services`] send on other threads: announcements of silent sources, and questions and notices
 //!   about calls.
@@ -15,6 +16,7 @@
 
 pub(crate) mod certificates;
 pub(crate) mod closings;
+pub(crate) mod direct_links;
 pub(crate) mod forward_table;
 pub(crate) mod link_table;
 pub(crate) mod network_ends;

@@ -371,6 +371,7 @@ impl Reloader {
             message_keys,
             member_names,
             observers,
+            direct: rules.direct.clone(),
             operators,
             rights,
             peer_rate,
@@ -546,6 +547,7 @@ fn merged(before: Config, read: Config) -> Config {
         accept: read.accept,
         metrics: read.metrics,
         observers: read.observers,
+        direct: read.direct,
         peer_rate: read.peer_rate,
         audit: read.audit,
         rotation: read.rotation,
@@ -647,6 +649,9 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     }
     if old.observers != new.observers {
         lines.push("who may ask this node how it is doing changed".to_owned());
+    }
+    if old.direct != new.direct {
+        lines.push("with whom direct links are made changed".to_owned());
     }
     if old.operators != new.operators {
         lines.push("who may change the fleet here changed".to_owned());

@@ -34,6 +34,8 @@ pub(crate) struct Rules {
     pub(crate) members: MemberNames,
     /// The peers that may ask this node how it is doing.
     pub(crate) observers: Grantees,
+    /// The peers that may have direct links.
+    pub(crate) direct: Grantees,
     /// The nodes that may change the fleet, if this node is its authority.
     pub(crate) operators: Grantees,
     /// The rights in the words of the configuration, for observers.
@@ -71,6 +73,7 @@ impl Rules {
         rules.members = MemberNames::from_config(config, identity);
         rules.rights = Arc::new(policy::written_rights(config, &rules.partners));
         rules.observers = policy::grantees(&config.observers(), identity, &rules.partners);
+        rules.direct = policy::grantees(&config.direct, identity, &rules.partners);
         let operators =
             config.authority.as_ref().map(|authority| &authority.operators[..]).unwrap_or_default();
         rules.operators = policy::grantees(operators, identity, &rules.partners);
@@ -214,7 +217,8 @@ fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> BTreeMap<N
     names.extend(rules.uses.iter().map(|rule| (rule.owner, rule.owner_name.clone())));
     let named = config.shares.iter().flat_map(|s| s.to.iter().chain(&s.publish));
     let operators = config.authority.iter().flat_map(|authority| &authority.operators);
-    for recipient in named.chain(operators).chain(config.observers.iter().flatten()) {
+    let named = named.chain(operators).chain(config.observers.iter().flatten()).chain(&config.direct);
+    for recipient in named {
         if let Recipient::Node(node) = recipient {
             names.extend(identity.node_id_of(node.as_str()).map(|id| (id, node.to_string())));
         }

@@ -1,0 +1,103 @@
+//! Direct links: questions for addresses, checks, and the peers with which data is exchanged.
+
+use std::collections::BTreeSet;
+use std::time::Instant;
+
+use bytes::Bytes;
+use sgc_ros::RosNetwork;
+use sgc_session::DirectOutput;
+use sgc_transport::{CheckDatagram, CloseReason};
+use sgc_trust::{Grantees, VerifiedPeer};
+use sgc_wire::{Decode as _, NodeId, PathOffer, PathQuestion, RefuseReason, SinkId};
+
+use super::Core;
+use crate::clock::now;
+use crate::drops::NodeDrop;
+use crate::link::direct_address::HostAddress;
+
+impl<N: RosNetwork> Core<N> {
+    /// Sets the peers that may have direct links.
+    pub(super) fn set_direct(&mut self, permitted: Grantees) {
+        let links = &self.links;
+        let peer_of = |link| links.get(link).map(|entry| entry.peer().clone());
+        for link in self.direct.set_permitted(permitted, peer_of) {
+            let because = "`direct` permits no direct link with the peer any more";
+            self.links.close(link, because.to_owned(), CloseReason::Goodbye);
+        }
+        self.endpoint.offer_paths(now(), self.direct.is_offered());
+    }
+
+    /// Answers a peer that asks for the addresses of this node.
+    pub(super) fn path_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, question: &Bytes) {
+        let answer = match PathQuestion::from_slice(question) {
+            _ if !self.direct.may_meet(peer) => {
+                self.control_drops.count_from(NodeDrop::DirectNotPermitted, peer.node_id);
+                Err(RefuseReason::NotPermitted)
+            }
+            Ok(question) => {
+                self.direct.asked(Instant::now(), peer.node_id, question).ok_or(RefuseReason::Limit)
+            }
+            Err(_) => Err(RefuseReason::RoleNotOffered),
+        };
+        self.endpoint.answer_path(now(), sink, answer);
+    }
+
+    pub(super) fn path_offered(&mut self, peer: NodeId, offer: &PathOffer) {
+        self.direct.offered(Instant::now(), peer, offer);
+    }
+
+    pub(super) fn path_refused(&mut self, peer: NodeId) {
+        self.direct.refused(Instant::now(), peer);
+    }
+
+    pub(super) fn check_arrived(&mut self, check: &CheckDatagram) {
+        self.direct.received(Instant::now(), check);
+    }
+
+    pub(super) fn host_addresses(&mut self, addresses: Vec<HostAddress>) {
+        self.direct.set_host(Instant::now(), addresses);
+    }
+
+    /// Passes on the addresses from which routers see this node come.
+    pub(super) fn reflexive_changed(&mut self) {
+        let direct = &self.direct;
+        let seen = self.links.iter().filter(|(id, entry)| {
+            let is_quic = entry.url().is_some_and(|url| url.starts_with("quic://"));
+            is_quic && !direct.is_direct(*id)
+        });
+        let seen: Vec<_> = seen.filter_map(|(_, entry)| entry.observed()).collect();
+        self.direct.set_reflexive(Instant::now(), seen.into_iter());
+    }
+
+    /// Looks with whom data is exchanged, and closes direct links that nothing uses.
+    pub(super) fn look_at_direct(&mut self, at: Instant) {
+        // A link that the user configured is as direct as one can be.
+        let (links, direct) = (&self.links, &self.direct);
+        let configured = links.iter().filter(|(id, _)| !direct.is_direct(*id));
+        let reached: BTreeSet<_> = configured.map(|(_, entry)| entry.peer().node_id).collect();
+        let owners = self.endpoint.data_owners().filter(|owner| !reached.contains(&owner.node_id));
+        self.direct.want(at, owners);
+        let router = &self.router;
+        for link in self.direct.unused(at, |link| router.has_branches(link)) {
+            self.links.close(link, "nothing uses the direct link".to_owned(), CloseReason::Goodbye);
+        }
+    }
+
+    /// Carries out what the search for direct paths wants. Returns `true` if there was something.
+    pub(super) fn drain_direct(&mut self) -> bool {
+        let mut progressed = false;
+        while let Some(output) = self.direct.poll() {
+            progressed = true;
+            match output {
+                DirectOutput::Ask { peer, question } => self.endpoint.ask_path(now(), peer, &question),
+                DirectOutput::Leave { peer } => self.endpoint.leave_path(now(), &peer),
+                // The sockets took the others.
+                DirectOutput::Send { .. }
+                | DirectOutput::Admit { .. }
+                | DirectOutput::Shut { .. }
+                | DirectOutput::Dial { .. } => {}
+            }
+        }
+        progressed
+    }
+}

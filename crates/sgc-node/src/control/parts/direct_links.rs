@@ -1,0 +1,288 @@
+//! [`DirectLinks`]: the direct links of this node, and what is needed to find them.
+//!
+//! [`sgc_session::DirectPaths`] decides. This part has the sockets, and knows which links are direct.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use rand_chacha::ChaCha20Rng;
+use sgc_router::{DirectReach, LinkId};
+use sgc_session::{DirectOutput, DirectPaths, LocalAddress, NoDirectPath};
+use sgc_transport::{CheckDatagram, DirectHandle};
+use sgc_trust::{Grantees, VerifiedPeer};
+use sgc_wire::{CandidateKind, NodeId, PATH_CANDIDATES_MAX, PathOffer, PathQuestion};
+use tokio::sync::mpsc;
+use tracing::debug;
+
+use crate::link::direct_address::{DirectDial, HostAddress};
+use crate::link::roaming::source_towards;
+
+/// Most reflexive addresses that peers are told; routers at several places may see several.
+const REFLEXIVE_MAX: usize = 3;
+/// Time without data after which a direct link is closed.
+const UNUSED_MAX: Duration = Duration::from_secs(120);
+
+/// The sockets of direct links, and the task that dials.
+pub(crate) struct DirectEnds {
+    pub(crate) handle: DirectHandle,
+    pub(crate) dials: mpsc::Sender<DirectDial>,
+}
+
+/// A direct link that is up.
+#[derive(Debug)]
+struct DirectLink {
+    peer: NodeId,
+    /// Time since which no branch uses it.
+    unused: Option<Instant>,
+}
+
+/// The direct links of this node.
+pub(crate) struct DirectLinks {
+    /// `None` at a node that only routes.
+    ends: Option<DirectEnds>,
+    paths: DirectPaths,
+    permitted: Grantees,
+    links: BTreeMap<LinkId, DirectLink>,
+    host: Vec<HostAddress>,
+    reflexive: BTreeSet<SocketAddr>,
+}
+
+impl DirectLinks {
+    pub(crate) fn new(own: NodeId, ends: Option<DirectEnds>, permitted: Grantees, rng: ChaCha20Rng) -> Self {
+        Self {
+            ends,
+            paths: DirectPaths::new(own, rng),
+            permitted,
+            links: BTreeMap::new(),
+            host: Vec::new(),
+            reflexive: BTreeSet::new(),
+        }
+    }
+
+    /// Returns `true` if this node has direct links with somebody.
+    pub(crate) fn is_offered(&self) -> bool {
+        self.ends.is_some() && !self.permitted.is_empty()
+    }
+
+    /// Sets the peers that may have direct links. Returns the links that are to be closed.
+    pub(crate) fn set_permitted(
+        &mut self,
+        permitted: Grantees,
+        peer_of: impl Fn(LinkId) -> Option<VerifiedPeer>,
+    ) -> Vec<LinkId> {
+        self.permitted = permitted;
+        let is_gone = |link: &LinkId| peer_of(*link).is_some_and(|peer| self.permitted.find(&peer).is_none());
+        self.links.keys().copied().filter(is_gone).collect()
+    }
+
+    /// Returns `true` if a peer may have a direct link.
+    pub(crate) fn may_meet(&self, peer: &VerifiedPeer) -> bool {
+        self.is_offered() && self.permitted.find(peer).is_some()
+    }
+
+    /// Sets the addresses of this host.
+    pub(crate) fn set_host(&mut self, now: Instant, host: Vec<HostAddress>) {
+        self.host = host;
+        self.addresses_changed(now);
+    }
+
+    /// Sets the addresses from which routers see this node come.
+    pub(crate) fn set_reflexive(&mut self, now: Instant, reflexive: impl Iterator<Item = SocketAddr>) {
+        let reflexive = reflexive.collect();
+        if self.reflexive != reflexive {
+            self.reflexive = reflexive;
+            self.addresses_changed(now);
+        }
+    }
+
+    fn addresses_changed(&mut self, now: Instant) {
+        let Some(ends) = &self.ends else { return };
+        let local = local_addresses(&self.host, &self.reflexive, ends.handle.ports());
+        debug!(?local, "addresses for direct links");
+        self.paths.set_local(now, local);
+    }
+
+    /// Sets the peers with which data is exchanged.
+    pub(crate) fn want<'a>(&mut self, now: Instant, owners: impl Iterator<Item = &'a VerifiedPeer>) {
+        if self.is_offered() {
+            let permitted = owners.filter(|peer| self.permitted.find(peer).is_some());
+            let wanted = permitted.map(|peer| peer.node_id).collect();
+            self.paths.want(now, &wanted);
+        }
+    }
+
+    /// Takes the question of a peer that may have a direct link.
+    pub(crate) fn asked(&mut self, now: Instant, peer: NodeId, question: PathQuestion) -> Option<PathOffer> {
+        self.paths.asked(now, peer, question)
+    }
+
+    pub(crate) fn offered(&mut self, now: Instant, peer: NodeId, offer: &PathOffer) {
+        self.paths.offered(now, peer, offer);
+    }
+
+    pub(crate) fn refused(&mut self, now: Instant, peer: NodeId) {
+        self.paths.refused(now, peer);
+    }
+
+    pub(crate) fn not_dialled(&mut self, now: Instant, peer: NodeId) {
+        self.paths.not_dialled(now, peer);
+    }
+
+    /// Takes a datagram that looks like a check.
+    pub(crate) fn received(&mut self, now: Instant, check: &CheckDatagram) {
+        let ip = check.to.or_else(|| source_towards(check.from));
+        let to = ip.map(|ip| SocketAddr::new(ip, check.port));
+        if let Some(to) = to {
+            self.paths.received(now, to, check.from, &check.datagram);
+        }
+    }
+
+    /// Notes a link that is up. Returns where it leads if it is a direct one.
+    pub(crate) fn link_up(
+        &mut self,
+        now: Instant,
+        link: LinkId,
+        peer: NodeId,
+        remote: SocketAddr,
+    ) -> Option<DirectReach> {
+        let is_direct = self.paths.is_expected(&peer, remote)
+            // The successor of a direct link, under another certificate.
+            || self.links.values().any(|known| known.peer == peer);
+        if !is_direct {
+            return None;
+        }
+        self.links.insert(link, DirectLink { peer, unused: None });
+        self.paths.linked(now, peer);
+        let is_near = self.host.iter().any(|host| host.is_near(remote.ip()));
+        Some(if is_near { DirectReach::Near } else { DirectReach::Far })
+    }
+
+    /// Notes that a link ended.
+    pub(crate) fn link_down(&mut self, now: Instant, link: LinkId) {
+        let Some(DirectLink { peer, .. }) = self.links.remove(&link) else { return };
+        if self.links.values().all(|other| other.peer != peer) {
+            self.paths.ended(now, peer);
+        }
+    }
+
+    /// Returns `true` for a direct link.
+    pub(crate) fn is_direct(&self, link: LinkId) -> bool {
+        self.links.contains_key(&link)
+    }
+
+    /// Returns the direct links that nothing has used for a while.
+    pub(crate) fn unused(&mut self, now: Instant, is_used: impl Fn(LinkId) -> bool) -> Vec<LinkId> {
+        let mut over = Vec::new();
+        for (link, direct) in &mut self.links {
+            direct.unused = if is_used(*link) { None } else { direct.unused.or(Some(now)) };
+            if direct.unused.is_some_and(|since| now.saturating_duration_since(since) >= UNUSED_MAX) {
+                over.push(*link);
+            }
+        }
+        over
+    }
+
+    /// Iterates over the peers with which data is exchanged over routers, with the reason.
+    pub(crate) fn relayed(&self) -> impl Iterator<Item = (NodeId, NoDirectPath)> {
+        self.paths.relayed()
+    }
+
+    /// Returns the number of checks that were not sent, of refused candidates, and of checks for which there was no room.
+    pub(crate) fn refusals(&self) -> (u64, u64, u64) {
+        let (withheld, candidates) = self.paths.refusals();
+        (withheld, candidates, self.ends.as_ref().map_or(0, |ends| ends.handle.overflowed()))
+    }
+
+    pub(crate) fn handle_timeout(&mut self, now: Instant) {
+        if self.paths.deadline().is_some_and(|at| at <= now) {
+            self.paths.handle_timeout(now);
+        }
+    }
+
+    pub(crate) fn deadline(&mut self) -> Option<Instant> {
+        self.paths.deadline()
+    }
+
+    /// Carries out the outputs that concern sockets. Returns the next question, or the end of one.
+    pub(crate) fn poll(&mut self) -> Option<DirectOutput> {
+        let ends = self.ends.as_ref()?;
+        loop {
+            let output = self.paths.poll();
+            ends.handle.take_checks(self.paths.has_attempts());
+            match output? {
+                // Another source than the system's has another mapping than the link would have.
+                DirectOutput::Send { from, to, datagram } => {
+                    if source_towards(to) == Some(from.ip()) {
+                        ends.handle.send(to, &datagram);
+                    }
+                }
+                DirectOutput::Admit { peer, from } => ends.handle.expect(from, peer),
+                DirectOutput::Shut { peer } => ends.handle.shut(&peer),
+                // A dial for which there is no room is one that failed: the attempt ends by its time.
+                DirectOutput::Dial { peer, to } => {
+                    let _ = ends.dials.try_send(DirectDial { peer, to });
+                }
+                output => return Some(output),
+            }
+        }
+    }
+}
+
+/// Returns the addresses that peers are told: those that routers see, then those of interfaces.
+fn local_addresses(
+    host: &[HostAddress],
+    reflexive: &BTreeSet<SocketAddr>,
+    ports: (Option<u16>, Option<u16>),
+) -> Vec<LocalAddress> {
+    let base = |host: &HostAddress| {
+        let port = if host.ip.is_ipv4() { ports.0 } else { ports.1 };
+        Some(SocketAddr::new(host.ip, port?))
+    };
+    let hosts: Vec<_> = host.iter().filter_map(base).collect();
+    // The first interface of its family stands for all: the socket is the same.
+    let seen = |address: &SocketAddr| {
+        let base = *hosts.iter().find(|host| host.is_ipv4() == address.is_ipv4())?;
+        let is_seen = !hosts.contains(address);
+        is_seen.then_some(LocalAddress { kind: CandidateKind::ServerReflexive, address: *address, base })
+    };
+    let of_host =
+        |address: &SocketAddr| LocalAddress { kind: CandidateKind::Host, address: *address, base: *address };
+    let reflexive = reflexive.iter().filter_map(seen).take(REFLEXIVE_MAX);
+    reflexive.chain(hosts.iter().map(of_host)).take(PATH_CANDIDATES_MAX).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn peers_are_told_what_routers_see_and_the_addresses_of_interfaces() {
+        let host = ["10.0.0.7", "192.0.2.7", "2001:db8::7"];
+        let host = host.map(|ip| HostAddress { ip: ip.parse().unwrap(), prefix: 24 }).to_vec();
+        let addresses = |texts: &[&str]| texts.iter().map(|text| text.parse().unwrap()).collect();
+        let told = |reflexive: &[&str], ports| {
+            let local = local_addresses(&host, &addresses(reflexive), ports);
+            local.iter().map(|local| (local.address.to_string(), local.base.to_string())).collect::<Vec<_>>()
+        };
+        let pair = |address: &str, base: &str| (address.to_owned(), base.to_owned());
+        let hosts = [
+            pair("10.0.0.7:5000", "10.0.0.7:5000"),
+            pair("192.0.2.7:5000", "192.0.2.7:5000"),
+            pair("[2001:db8::7]:6000", "[2001:db8::7]:6000"),
+        ];
+        let both = (Some(5000), Some(6000));
+        assert_eq!(told(&[], both), hosts);
+        // A router on the same network sees the address of the interface.
+        assert_eq!(told(&["192.0.2.7:5000"], both), hosts);
+        let told_with_nat = told(&["203.0.113.9:40000", "192.0.2.7:5000"], both);
+        assert_eq!(told_with_nat[0], pair("203.0.113.9:40000", "10.0.0.7:5000"));
+        assert_eq!(told_with_nat[1..], hosts);
+        let many = told(&["203.0.113.9:1", "203.0.113.9:2", "203.0.113.9:3", "203.0.113.9:4"], both);
+        assert_eq!(many.len(), REFLEXIVE_MAX + hosts.len());
+        assert_eq!(
+            told(&["203.0.113.9:1"], (None, Some(6000))),
+            [pair("[2001:db8::7]:6000", "[2001:db8::7]:6000")]
+        );
+    }
+}

@@ -1,0 +1,224 @@
+//! Direct links: which networks allow them, how soon they come, and what a change of the path costs.
+
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use sgc_testkit::FakeDomain;
+
+use crate::flow::{Flow, LATE};
+use crate::lab::{Lab, Nat, RANGES};
+use crate::node::Node;
+use crate::support::{eventually, say};
+use crate::{CALM, Pair, cable, can_run, turn};
+
+/// Time after which no direct link comes any more.
+const HOPELESS: Duration = Duration::from_secs(6);
+
+fn direct_links(node: &Node) -> usize {
+    let status = node.status();
+    let links = status["links"].as_array().cloned().unwrap();
+    links.iter().filter(|link| link["direct"] == true).count()
+}
+
+/// Returns why a node has no direct link to its only peer.
+fn why_not(node: &Node) -> Option<String> {
+    Some(node.status()["not_direct"][0]["why"].as_str()?.to_owned())
+}
+
+/// Ends the flows. Returns what was wrong with them.
+fn judge(pair: &Pair) -> Vec<String> {
+    pair.flows.iter().for_each(|flow| flow.end());
+    let mut wrong = Vec::new();
+    for flow in &pair.flows {
+        if flow.topic.reliable {
+            eventually("the last message", || flow.has_heard(flow.said()));
+        }
+        let verdict = flow.judge(Instant::now());
+        let lost = if flow.topic.reliable { verdict.lost } else { 0 };
+        if lost + verdict.doubled + verdict.late > 0 {
+            let (name, doubled, late) = (flow.topic.name, verdict.doubled, verdict.late);
+            wrong.push(format!("{name}: {lost} lost, {doubled} doubled, {late} late"));
+        }
+    }
+    wrong
+}
+
+#[test]
+fn nodes_behind_nats_get_a_direct_link_as_theory_says() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let nats = [
+        ("public", Nat::Public),
+        ("firewall", Nat::Firewall),
+        ("full cone", Nat::FullCone),
+        ("port restricted", Nat::PortRestricted),
+        ("symmetric", Nat::RandomPort(RANGES[0])),
+    ];
+    say("\nDirect links\n  robot            desk             after, ms");
+    for (n, (near, near_nat)) in nats.iter().enumerate() {
+        for (far, far_nat) in &nats[n..] {
+            let lab = Lab::new(cable(), *near_nat);
+            lab.set_far_nat(*far_nat);
+            let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+            let pair = Pair::start(&lab, "quic", &[&lab.url("quic")]);
+            pair.wait_for("never begins", |_| 1);
+            let begun = Instant::now();
+            let is_feasible =
+                *far != "symmetric" || !["firewall", "port restricted", "symmetric"].contains(near);
+            if is_feasible {
+                eventually(&format!("a direct link, {near} to {far}"), || direct_links(&pair.robot) > 0);
+                let after = begun.elapsed();
+                eventually("also at the other end", || direct_links(&pair.desk) > 0);
+                say(&format!("  {near:<16} {far:<16} {:>9}", after.as_millis()));
+            } else {
+                let blocked = |why: String| why.starts_with("no packet passes");
+                eventually("it is given up", || why_not(&pair.desk).is_some_and(blocked));
+                assert!(begun.elapsed() < 3 * HOPELESS, "{near} to {far}");
+                assert_eq!(direct_links(&pair.robot), 0, "{near} to {far}");
+                say(&format!("  {near:<16} {far:<16}   relayed"));
+            }
+            pair.wait_for("does not go on", |flow| flow.said() + 1);
+            sleep(CALM);
+            let wrong = judge(&pair);
+            assert!(wrong.is_empty(), "{near} to {far}: {wrong:?}");
+        }
+    }
+}
+
+/// A robot and a desk with a direct link, and their router.
+fn direct_pair(lab: &Lab) -> (Node, Pair) {
+    let cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+    let pair = Pair::start(lab, "quic", &[&lab.url("quic")]);
+    pair.wait_for("never begins", |_| 1);
+    for node in [&pair.robot, &pair.desk] {
+        eventually("a direct link", || direct_links(node) == 1);
+    }
+    // The branches move to it.
+    eventually("data on the direct link", || carried(&pair.robot, true) > 20_000);
+    (cloud, pair)
+}
+
+/// Returns the bytes that a node sent over its direct links, or over the others.
+fn carried(node: &Node, is_direct: bool) -> u64 {
+    let links = node.status()["links"].as_array().cloned().unwrap();
+    let of_kind = links.iter().filter(|link| link["direct"] == is_direct);
+    of_kind.filter_map(|link| link["sent_bytes"].as_u64()).sum()
+}
+
+#[test]
+fn router_carries_keep_alives_alone_and_takes_over_when_the_direct_path_dies() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::PortRestricted);
+    let (_cloud, pair) = direct_pair(&lab);
+    sleep(CALM);
+    let before = (carried(&pair.robot, true), carried(&pair.robot, false));
+    sleep(2 * CALM);
+    let after = (carried(&pair.robot, true), carried(&pair.robot, false));
+    let (direct, relayed) = (after.0 - before.0, after.1 - before.1);
+    assert!(direct > 5 * relayed, "{direct} bytes directly, {relayed} over the router");
+    for round in 0..2 {
+        let begun = Instant::now();
+        lab.cut_between_sites();
+        pair.wait_for("does not go on over the router", |flow| flow.said() + 1);
+        sleep(CALM);
+        let outage = pair.flows.iter().map(|flow| flow.judge(begun).outage).max().unwrap();
+        eventually("it is said", || why_not(&pair.desk).is_some());
+        lab.join_sites();
+        let back = Instant::now();
+        eventually("a direct link again", || direct_links(&pair.robot) == 1 && direct_links(&pair.desk) == 1);
+        let (outage, back) = (outage.as_millis(), back.elapsed().as_millis());
+        say(&format!(
+            "\nThe direct path dies, round {round}: {outage} ms without data, direct again after {back} ms"
+        ));
+        pair.wait_for("does not go on", |flow| flow.said() + 1);
+    }
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+#[test]
+fn nodes_with_a_direct_link_need_no_router() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::Public);
+    let (cloud, pair) = direct_pair(&lab);
+    drop(cloud);
+    pair.wait_for("does not go on without the router", |flow| flow.said() + 1);
+    // A topic that nobody published while there was a router.
+    let late = Flow::start(LATE, &pair.near, &pair.far);
+    eventually("a new topic", || late.has_heard(10));
+    let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+    for node in [&pair.robot, &pair.desk] {
+        eventually("both have the router again", || node.status()["links"].as_array().unwrap().len() == 2);
+    }
+    pair.wait_for("does not go on", |flow| flow.said() + 1);
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+#[test]
+fn one_copy_passes_the_uplink_however_many_direct_links_there_are() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::PortRestricted);
+    let (_cloud, pair) = direct_pair(&lab);
+    let video = pair.flows.iter().find(|flow| !flow.topic.reliable).unwrap();
+    // A second desk in the same network, for both topics of the robot.
+    let uses = "[[use]]\nfrom = \"robot-quic\"\ntopic = \"/video\"\n";
+    let file = lab.write_config("desk-2", &[&lab.url("quic")], uses);
+    let domain = FakeDomain::default();
+    let second = Node::start(&lab.desk, &file, lab.enroll("desk-2", false), Some(&domain));
+    let ears = video.listen(&domain);
+    eventually("the second desk hears it", || ears.count() > 0);
+    eventually("it has a direct link, too", || direct_links(&second) == 1);
+    // Messages of 500 bytes, 20 a second: 10 kB/s a copy.
+    sleep(2 * CALM);
+    let before = (carried(&pair.robot, true), carried(&pair.robot, false));
+    let heard = ears.count();
+    sleep(3 * CALM);
+    let (direct, relayed) = (carried(&pair.robot, true) - before.0, carried(&pair.robot, false) - before.1);
+    assert!(ears.count() > heard + 30);
+    // The other topic, 64 bytes 50 times a second, goes to the first desk alone, and directly.
+    assert!(relayed > 25_000 && relayed < 50_000, "{direct} bytes directly, {relayed} over the router");
+    assert!(direct < 30_000, "{direct} bytes directly, {relayed} over the router");
+    drop(second);
+    eventually("the camera goes directly again", || {
+        let before = carried(&pair.robot, false);
+        sleep(CALM);
+        carried(&pair.robot, false) - before < 4_000
+    });
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+#[test]
+fn node_that_permits_no_direct_link_tells_no_address() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::Public);
+    let cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+    let shares = "direct = [\"group:operators\"]\n[ros]\ndomain_id = 0\n\
+        [[share]]\ntopic = \"/state\"\nto = [\"desk\"]\n[[share]]\ntopic = \"/video\"\nto = [\"desk\"]\n";
+    let uses =
+        "[[use]]\nfrom = \"robot\"\ntopic = \"/state\"\n[[use]]\nfrom = \"robot\"\ntopic = \"/video\"\n";
+    let pair = Pair::with(&lab, "quic", ["robot", "desk"], [shares, uses], &[&lab.url("quic")]);
+    pair.wait_for("never begins", |_| 1);
+    eventually("it is refused", || {
+        why_not(&pair.desk).is_some_and(|why| why.contains("permits no direct link"))
+    });
+    assert_eq!(pair.robot.status()["drops"]["direct_not_permitted"], 1);
+    assert_eq!((direct_links(&pair.robot), direct_links(&pair.desk)), (0, 0));
+    assert!(judge(&pair).is_empty());
+    drop(cloud);
+}
