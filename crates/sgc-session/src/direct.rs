@@ -183,14 +183,16 @@ impl DirectPaths {
             return;
         }
         self.local = local;
+        let mut under_way = Vec::new();
         for (node, peer) in &mut self.peers {
-            if peer.attempt.take().is_some() {
-                self.outputs.push_back(DirectOutput::Leave { peer: *node });
-            }
-            if peer.linked.is_none() && peer.is_wanted {
-                (peer.failures, peer.retry_at) = (0, Some(now));
+            peer.failures = 0;
+            if peer.attempt.is_some() {
+                under_way.push(*node);
+            } else if peer.linked.is_none() && peer.is_wanted {
+                peer.retry_at = Some(now);
             }
         }
+        under_way.into_iter().for_each(|node| self.begin(now, node));
     }
 
     /// Sets the peers with which this node exchanges data, beyond those that look for a path to it.
@@ -218,7 +220,7 @@ impl DirectPaths {
         let is_full = self.peers.len() >= DIRECT_PEERS_MAX;
         let peer = match self.peers.get_mut(&node) {
             Some(peer) => peer,
-            None if is_full || node == self.own => return None,
+            None if is_full || node == self.own || self.local.is_empty() => return None,
             None => self.peers.entry(node).or_insert_with(|| Peer::new(false, now)),
         };
         let is_new = peer.attempt.is_none();
@@ -346,6 +348,11 @@ impl DirectPaths {
     pub fn relayed(&self) -> impl Iterator<Item = (NodeId, NoDirectPath)> {
         let relayed = self.peers.iter().filter(|(_, peer)| peer.is_wanted && peer.linked.is_none());
         relayed.map(|(node, peer)| (*node, peer.why_not))
+    }
+
+    /// Returns `true` if this node exchanges data with a peer.
+    pub fn is_wanted(&self, node: &NodeId) -> bool {
+        self.peers.get(node).is_some_and(|peer| peer.is_wanted)
     }
 
     /// Returns `true` if a check may arrive.

@@ -138,6 +138,12 @@ impl Names {
         self.interests.is_watched(name)
     }
 
+    /// Returns `true` if a link is interested in a name of this node.
+    pub(crate) fn wants_own(&self, link: LinkId) -> bool {
+        let is_own = |name: &Name| self.owner(name).is_some_and(|owner| owner.node_id == self.own);
+        self.interests.names(link).iter().any(is_own)
+    }
+
     /// Returns `true` if routers are told of names that they did not ask for.
     pub(crate) fn tells_unasked(&self) -> bool {
         self.mapping.tells_unasked()

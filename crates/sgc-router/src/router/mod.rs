@@ -281,9 +281,9 @@ impl Router {
         Some(self.links.get(link)?.hello()?.minor)
     }
 
-    /// Returns `true` if a branch of some name uses a link.
-    pub fn has_branches(&self, link: LinkId) -> bool {
-        self.trees.uses(link)
+    /// Returns `true` if a branch of some name uses a link, or the node there is interested in a name of this one.
+    pub fn is_used(&self, link: LinkId) -> bool {
+        self.trees.uses(link) || self.names.wants_own(link)
     }
 
     /// Returns the cost of a link, microseconds of round trip, and whether it seems dead.

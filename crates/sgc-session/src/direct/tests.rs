@@ -457,6 +457,22 @@ fn node_that_restarts_in_the_middle_of_an_attempt_finds_the_path_all_the_same() 
 }
 
 #[test]
+fn address_that_becomes_known_in_the_middle_of_an_attempt_is_used_at_once() {
+    for late in 0..2 {
+        let mut world = World::new([Some(PORT_RESTRICTED), Some(PORT_RESTRICTED)]);
+        let local = world.sides[late].machine.local.clone();
+        let hosts = local.iter().filter(|local| local.kind == CandidateKind::Host).copied().collect();
+        world.sides[late].machine.set_local(world.now, hosts);
+        world.want(0);
+        world.run(Duration::from_millis(1200));
+        assert_eq!(world.linked, None);
+        world.sides[late].machine.set_local(world.now, local);
+        world.run(Duration::from_millis(600));
+        assert!(world.linked.is_some(), "{late}");
+    }
+}
+
+#[test]
 fn attempts_that_fail_become_rare_until_the_network_changes() {
     let mut world = World::new([Some(SYMMETRIC), Some(SYMMETRIC)]);
     world.want(0);

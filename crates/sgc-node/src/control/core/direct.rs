@@ -78,7 +78,7 @@ impl<N: RosNetwork> Core<N> {
         let owners = self.endpoint.data_owners().filter(|owner| !reached.contains(&owner.node_id));
         self.direct.want(at, owners);
         let router = &self.router;
-        for link in self.direct.unused(at, |link| router.has_branches(link)) {
+        for link in self.direct.unused(at, |link| router.is_used(link)) {
             self.links.close(link, "nothing uses the direct link".to_owned(), CloseReason::Goodbye);
         }
     }

@@ -20,7 +20,7 @@ use crate::link::roaming::source_towards;
 
 /// Most reflexive addresses that peers are told; routers at several places may see several.
 const REFLEXIVE_MAX: usize = 3;
-/// Time without data after which a direct link is closed.
+/// Time after which a direct link is closed over which neither node wants data.
 const UNUSED_MAX: Duration = Duration::from_secs(120);
 
 /// The sockets of direct links, and the task that dials.
@@ -33,7 +33,7 @@ pub(crate) struct DirectEnds {
 #[derive(Debug)]
 struct DirectLink {
     peer: NodeId,
-    /// Time since which no branch uses it.
+    /// Time since which neither node wants data of the other.
     unused: Option<Instant>,
 }
 
@@ -175,7 +175,9 @@ impl DirectLinks {
     pub(crate) fn unused(&mut self, now: Instant, is_used: impl Fn(LinkId) -> bool) -> Vec<LinkId> {
         let mut over = Vec::new();
         for (link, direct) in &mut self.links {
-            direct.unused = if is_used(*link) { None } else { direct.unused.or(Some(now)) };
+            // Data that goes over a router to spare the uplink may come back.
+            let is_used = is_used(*link) || self.paths.is_wanted(&direct.peer);
+            direct.unused = if is_used { None } else { direct.unused.or(Some(now)) };
             if direct.unused.is_some_and(|since| now.saturating_duration_since(since) >= UNUSED_MAX) {
                 over.push(*link);
             }
