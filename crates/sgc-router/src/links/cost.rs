@@ -12,7 +12,7 @@ pub(crate) const COST_SUSPECT: u32 = 1 << 28;
 const COST_CHANGE_MIN: u32 = 2000;
 /// Time for which it must have differed.
 const COST_CHANGE_AFTER: Duration = Duration::from_secs(5);
-/// A cost that differs by less than a quarter is not announced anew.
+/// A cost that differs by less than a quarter is not announced anew, and a direct link costs a quarter less.
 const COST_PART: u32 = 4;
 
 /// Returns `true` if a neighbour that was told `old` has to be told `new`.
@@ -32,17 +32,25 @@ pub(crate) struct Cost {
     differs_since: Option<Instant>,
     /// Set while nothing at all arrives over the link.
     suspect: bool,
+    /// A direct link is taken unless it is clearly worse than a path over routers.
+    is_direct: bool,
 }
 
 impl Cost {
     pub(crate) fn new(set: Option<u32>) -> Self {
-        Self { set, smoothed: None, counts: None, differs_since: None, suspect: false }
+        Self { set, smoothed: None, counts: None, differs_since: None, suspect: false, is_direct: false }
+    }
+
+    /// Returns the cost of a direct link.
+    pub(crate) fn of_direct_link() -> Self {
+        Self { is_direct: true, ..Self::new(None) }
     }
 
     /// Returns the present cost.
     pub(crate) fn now(&self) -> u32 {
         let measured = || self.counts.map_or(COST_UNKNOWN, |rtt| rtt.saturating_add(COST_OF_LINK));
         let cost = self.set.unwrap_or_else(measured);
+        let cost = if self.is_direct { cost - cost / COST_PART } else { cost };
         if self.suspect { cost.saturating_add(COST_SUSPECT) } else { cost }
     }
 
@@ -94,6 +102,25 @@ mod tests {
         let moved = (0..600).find(|n| cost.measure(later + ms(100 * n), ms(60), false)).unwrap();
         assert!(moved * 100 >= 5000, "moved after {moved} tenths of a second");
         assert!(cost.now() > 2 * first && (0..600).all(|n| !cost.measure(later + ms(n), ms(60), false)));
+    }
+
+    #[test]
+    fn direct_link_takes_over_from_a_path_of_the_same_round_trip_and_gives_way_to_a_clearly_better_one() {
+        #[allow(clippy::disallowed_methods)]
+        let start = Instant::now();
+        for rtt in [1, 20, 300] {
+            let mut direct = Cost::of_direct_link();
+            direct.measure(start, ms(rtt), false);
+            let mut relayed = Cost::new(None);
+            relayed.measure(start, ms(rtt), false);
+            assert!(direct.now() < relayed.now() && cost_differs(relayed.now(), direct.now()), "{rtt} ms");
+        }
+        let mut direct = Cost::of_direct_link();
+        direct.measure(start, ms(100), false);
+        let mut relayed = Cost::new(None);
+        relayed.measure(start, ms(40), false);
+        assert!(relayed.now() < direct.now() && cost_differs(direct.now(), relayed.now()));
+        assert!(direct.measure(start, ms(100), true) && direct.now() > COST_SUSPECT);
     }
 
     #[test]

@@ -80,7 +80,7 @@ impl Link {
             not_after,
             expires: None,
             hello: None,
-            cost: Cost::new(cost),
+            cost: if direct.is_some() { Cost::of_direct_link() } else { Cost::new(cost) },
             direct,
             clock: None,
             repeated: None,

@@ -139,8 +139,14 @@ impl<N: RosNetwork> Core<N> {
     fn path_to_owner(&self, name: &Name) -> Option<PathToOwner> {
         let owner = self.endpoint.owner_of(name)?;
         let (link, cost_us) = self.router.route(name)?;
-        let via = self.links.get(link)?.peer().node_id;
-        Some(PathToOwner { via, is_direct: via == owner, cost_us: cost_us.into() })
+        let entry = self.links.get(link)?;
+        let via = entry.peer().node_id;
+        // Routing counts less for a direct link than it takes.
+        let cost_us = match self.direct.is_direct(link) {
+            true => entry.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
+            false => cost_us.into(),
+        };
+        Some(PathToOwner { via, is_direct: via == owner, cost_us })
     }
 
     fn node_report(&self) -> NodeReport {
