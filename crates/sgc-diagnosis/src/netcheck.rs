@@ -229,7 +229,11 @@ impl Mapping {
 }
 
 impl RouterView {
+    /// Returns the view of a router; `None` for other peers.
     fn of(link: &Link) -> Option<Self> {
+        if link.direct {
+            return None;
+        }
         Some(Self {
             url: link.url.clone()?,
             remote: link.remote.parse().ok(),
@@ -292,6 +296,15 @@ mod tests {
         }]);
         let document = json!({ "node": "robot", "links": links, "routers": routers });
         Netcheck::of(&serde_json::from_value(document).unwrap())
+    }
+
+    #[test]
+    fn peer_of_a_direct_link_is_no_router() {
+        let mut direct = link("quic://203.0.113.9:4000", "203.0.113.9:4000", Some("192.0.2.77:1"));
+        direct["direct"] = json!(true);
+        let router = link("quic://r.example:7447", "198.51.100.1:7447", Some("10.0.0.5:7000"));
+        let netcheck = netcheck(&[router, direct]);
+        assert_eq!((netcheck.links.len(), netcheck.nat), (1, Nat::None));
     }
 
     #[test]

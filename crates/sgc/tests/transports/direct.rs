@@ -9,10 +9,12 @@ use crate::flow::{Flow, LATE};
 use crate::lab::{Lab, Nat, RANGES};
 use crate::node::Node;
 use crate::support::{eventually, say};
-use crate::{CALM, Pair, cable, can_run, turn};
+use crate::{CALM, Pair, cable, can_run, is_long, turn};
 
-/// Time after which no direct link comes any more.
-const HOPELESS: Duration = Duration::from_secs(6);
+/// Number of tries in the long run for each pair of networks, unless `SGC_DIRECT_TRIES` has another.
+const TRIES_LONG: u32 = 200;
+/// Time in which a first attempt succeeds, from the start of the node on.
+const FIRST_ATTEMPT: Duration = Duration::from_secs(2);
 
 fn direct_links(node: &Node) -> usize {
     let status = node.status();
@@ -43,6 +45,21 @@ fn judge(pair: &Pair) -> Vec<String> {
     wrong
 }
 
+/// Restarts the desk again and again. Its first attempt has to succeed nearly always.
+fn try_often(lab: &Lab, pair: &mut Pair, what: &str) {
+    let tries = std::env::var("SGC_DIRECT_TRIES").map_or(TRIES_LONG, |tries| tries.parse().unwrap());
+    let mut soon = 0;
+    for _ in 0..tries {
+        pair.restart_desk(lab);
+        let begun = Instant::now();
+        eventually(&format!("a direct link, {what}"), || direct_links(&pair.desk) > 0);
+        soon += u32::from(begun.elapsed() < FIRST_ATTEMPT);
+    }
+    say(&format!("  {what}: {soon} of {tries} at the first attempt"));
+    assert!(soon * 100 >= 95 * tries, "{what}: {soon} of {tries}");
+}
+
+/// All pairs of networks in the long run, and some in the short one. `sgc-session` has all of them on a virtual clock.
 #[test]
 fn nodes_behind_nats_get_a_direct_link_as_theory_says() {
     if !can_run() {
@@ -56,34 +73,41 @@ fn nodes_behind_nats_get_a_direct_link_as_theory_says() {
         ("port restricted", Nat::PortRestricted),
         ("symmetric", Nat::RandomPort(RANGES[0])),
     ];
+    let short = [(0, 4), (1, 2), (3, 3), (2, 4), (3, 4)];
+    let all = (0..nats.len()).flat_map(|near| (near..nats.len()).map(move |far| (near, far)));
+    let pairs: Vec<_> = if is_long() { all.collect() } else { short.to_vec() };
     say("\nDirect links\n  robot            desk             after, ms");
-    for (n, (near, near_nat)) in nats.iter().enumerate() {
-        for (far, far_nat) in &nats[n..] {
-            let lab = Lab::new(cable(), *near_nat);
-            lab.set_far_nat(*far_nat);
-            let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
-            let pair = Pair::start(&lab, "quic", &[&lab.url("quic")]);
-            pair.wait_for("never begins", |_| 1);
-            let begun = Instant::now();
-            let is_feasible =
-                *far != "symmetric" || !["firewall", "port restricted", "symmetric"].contains(near);
-            if is_feasible {
-                eventually(&format!("a direct link, {near} to {far}"), || direct_links(&pair.robot) > 0);
-                let after = begun.elapsed();
-                eventually("also at the other end", || direct_links(&pair.desk) > 0);
-                say(&format!("  {near:<16} {far:<16} {:>9}", after.as_millis()));
-            } else {
-                let blocked = |why: String| why.starts_with("no packet passes");
-                eventually("it is given up", || why_not(&pair.desk).is_some_and(blocked));
-                assert!(begun.elapsed() < 3 * HOPELESS, "{near} to {far}");
-                assert_eq!(direct_links(&pair.robot), 0, "{near} to {far}");
-                say(&format!("  {near:<16} {far:<16}   relayed"));
-            }
-            pair.wait_for("does not go on", |flow| flow.said() + 1);
-            sleep(CALM);
-            let wrong = judge(&pair);
-            assert!(wrong.is_empty(), "{near} to {far}: {wrong:?}");
-        }
+    for (near, far) in pairs {
+        meet(nats[near], nats[far]);
+    }
+}
+
+/// Lets a robot and a desk in these networks exchange data.
+fn meet((near, near_nat): (&str, Nat), (far, far_nat): (&str, Nat)) {
+    let lab = Lab::new(cable(), near_nat);
+    lab.set_far_nat(far_nat);
+    let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+    let mut pair = Pair::start(&lab, "quic", &[&lab.url("quic")]);
+    pair.wait_for("never begins", |_| 1);
+    let begun = Instant::now();
+    let is_feasible = far != "symmetric" || !["firewall", "port restricted", "symmetric"].contains(&near);
+    if is_feasible {
+        eventually(&format!("a direct link, {near} to {far}"), || direct_links(&pair.robot) > 0);
+        let after = begun.elapsed();
+        eventually("also at the other end", || direct_links(&pair.desk) > 0);
+        say(&format!("  {near:<16} {far:<16} {:>9}", after.as_millis()));
+    } else {
+        let blocked = |why: String| why.starts_with("no packet passes");
+        eventually("it is given up", || why_not(&pair.desk).is_some_and(blocked));
+        assert_eq!(direct_links(&pair.robot), 0, "{near} to {far}");
+        say(&format!("  {near:<16} {far:<16}   relayed"));
+    }
+    pair.wait_for("does not go on", |flow| flow.said() + 1);
+    sleep(CALM);
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{near} to {far}: {wrong:?}");
+    if is_feasible && is_long() {
+        try_often(&lab, &mut pair, &format!("{near} to {far}"));
     }
 }
 
@@ -121,7 +145,7 @@ fn router_carries_keep_alives_alone_and_takes_over_when_the_direct_path_dies() {
     let after = (carried(&pair.robot, true), carried(&pair.robot, false));
     let (direct, relayed) = (after.0 - before.0, after.1 - before.1);
     assert!(direct > 5 * relayed, "{direct} bytes directly, {relayed} over the router");
-    for round in 0..2 {
+    for round in 0..if is_long() { 5 } else { 1 } {
         let begun = Instant::now();
         lab.cut_between_sites();
         pair.wait_for("does not go on over the router", |flow| flow.said() + 1);
@@ -221,4 +245,48 @@ fn node_that_permits_no_direct_link_tells_no_address() {
     assert_eq!((direct_links(&pair.robot), direct_links(&pair.desk)), (0, 0));
     assert!(judge(&pair).is_empty());
     drop(cloud);
+}
+
+#[test]
+fn node_on_the_same_network_does_not_count_for_the_uplink() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::PortRestricted);
+    let (_cloud, pair) = direct_pair(&lab);
+    let video = pair.flows.iter().find(|flow| !flow.topic.reliable).unwrap();
+    let uses = "[[use]]\nfrom = \"robot-quic\"\ntopic = \"/video\"\n";
+    let file = lab.write_config("desk-2", &[&lab.url("quic")], uses);
+    let domain = FakeDomain::default();
+    let second = Node::start(&lab.robot, &file, lab.enroll("desk-2", false), Some(&domain));
+    let ears = video.listen(&domain);
+    eventually("the second desk hears it", || ears.count() > 0);
+    eventually("it has a direct link, too", || direct_links(&second) == 1);
+    sleep(2 * CALM);
+    let before = carried(&pair.robot, false);
+    let heard = ears.count();
+    sleep(3 * CALM);
+    let relayed = carried(&pair.robot, false) - before;
+    assert!(ears.count() > heard + 30 && relayed < 10_000, "{relayed} bytes over the router");
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+#[test]
+fn robot_whose_udp_is_blocked_stays_with_its_router_and_says_why() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::Public);
+    lab.block_udp();
+    let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+    let pair = Pair::start(&lab, "quic", &[&lab.url("tls")]);
+    pair.wait_for("never begins", |_| 1);
+    let blocked = |why: String| why.starts_with("no packet passes");
+    eventually("it is given up", || why_not(&pair.desk).is_some_and(blocked));
+    assert_eq!((direct_links(&pair.robot), direct_links(&pair.desk)), (0, 0));
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
 }

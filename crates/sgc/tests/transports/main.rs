@@ -87,6 +87,15 @@ impl Pair {
         Self { scheme, flows, robot, desk, near, far }
     }
 
+    /// Ends the desk, and starts it again under the same name.
+    fn restart_desk(&mut self, lab: &Lab) {
+        let desk = format!("desk-{}", self.scheme);
+        // Two runs at one time would take the place of each other.
+        self.desk.stop();
+        let file = lab.path(&format!("{desk}.toml"));
+        self.desk = Node::start(&lab.desk, &file, lab.enroll(&desk, false), Some(&self.far));
+    }
+
     fn wait_for(&self, what: &str, after: impl Fn(&Flow) -> u64) {
         for flow in &self.flows {
             let number = after(flow);

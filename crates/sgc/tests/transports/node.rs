@@ -63,11 +63,18 @@ impl Node {
         stream.read_to_string(&mut text).unwrap();
         serde_json::from_str(&text).unwrap()
     }
+
+    /// Ends the node.
+    pub(crate) fn stop(&mut self) {
+        if let Some(stop) = self.stop.take() {
+            let _ = stop.send(());
+            let _ = self.ended.recv_timeout(PATIENCE);
+        }
+    }
 }
 
 impl Drop for Node {
     fn drop(&mut self) {
-        let _ = self.stop.take().map(|stop| stop.send(()));
-        let _ = self.ended.recv_timeout(PATIENCE);
+        self.stop();
     }
 }

@@ -78,7 +78,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn kept_out(&mut self, link: LinkId, place: Place) {
         let Some(entry) = self.links.get(link) else { return };
         // Other peers have no links from which a process could be kept out.
-        if !entry.peer().may_route && entry.url().is_none() {
+        if (!entry.peer().may_route && entry.url().is_none()) || self.direct.is_direct(link) {
             self.control_drops.count_from(&DropReason::Unknown { what: "identity" }, link);
             return;
         }

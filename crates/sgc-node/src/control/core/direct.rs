@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use sgc_ros::RosNetwork;
+use sgc_router::LinkId;
 use sgc_session::DirectOutput;
 use sgc_transport::{CheckDatagram, CloseReason};
 use sgc_trust::{Grantees, VerifiedPeer};
@@ -21,10 +22,15 @@ impl<N: RosNetwork> Core<N> {
         let links = &self.links;
         let peer_of = |link| links.get(link).map(|entry| entry.peer().clone());
         for link in self.direct.set_permitted(permitted, peer_of) {
-            let because = "`direct` permits no direct link with the peer any more";
-            self.links.close(link, because.to_owned(), CloseReason::Goodbye);
+            self.close_not_permitted(link);
         }
         self.endpoint.offer_paths(now(), self.direct.is_offered());
+    }
+
+    /// Closes a direct link that is not permitted any more.
+    pub(super) fn close_not_permitted(&mut self, link: LinkId) {
+        let because = "`direct` permits no direct link with the peer any more";
+        self.links.close(link, because.to_owned(), CloseReason::Goodbye);
     }
 
     /// Answers a peer that asks for the addresses of this node.

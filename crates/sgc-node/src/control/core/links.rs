@@ -53,6 +53,9 @@ impl<N: RosNetwork> Core<N> {
         let is_abandoned = reply.send(Some(place)).is_err();
         self.router.handle_link_up(now(), id, neighbour);
         self.router.handle_link_quality(now(), id, rtt, false);
+        if direct.is_some() && !self.direct.may_meet(link.peer()) {
+            self.close_not_permitted(id);
+        }
         if is_abandoned {
             // Its task ended meanwhile, so nobody would report the end of the link.
             debug!(%remote, "the link's task is gone");

@@ -105,11 +105,8 @@ impl DirectLinks {
 
     /// Sets the peers with which data is exchanged.
     pub(crate) fn want<'a>(&mut self, now: Instant, owners: impl Iterator<Item = &'a VerifiedPeer>) {
-        if self.is_offered() {
-            let permitted = owners.filter(|peer| self.permitted.find(peer).is_some());
-            let wanted = permitted.map(|peer| peer.node_id).collect();
-            self.paths.want(now, &wanted);
-        }
+        let wanted = owners.filter(|peer| self.may_meet(peer)).map(|peer| peer.node_id).collect();
+        self.paths.want(now, &wanted);
     }
 
     /// Takes the question of a peer that may have a direct link.
