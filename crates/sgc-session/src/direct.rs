@@ -36,8 +36,9 @@ const RETRY_MIN: Duration = Duration::from_secs(2);
 const RETRY_MAX: Duration = Duration::from_secs(300);
 /// A link that was up for less counts as a failure, so that a path that works badly is not used again and again.
 const LINK_PROVEN_AFTER: Duration = Duration::from_secs(60);
-/// Shortest time between two attempts that one peer begins.
-const ASKED_EVERY: Duration = Duration::from_secs(1);
+/// Most attempts that one peer begins within a time. Programs that are restarted need a few.
+const ASKED_MAX: usize = 4;
+const ASKED_WITHIN: Duration = Duration::from_secs(10);
 
 /// Work for the driver.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -126,8 +127,8 @@ struct Peer {
     failures: u32,
     retry_at: Option<Instant>,
     why_not: NoDirectPath,
-    /// Time from which it may begin another attempt.
-    may_ask_at: Option<Instant>,
+    /// Times of the last attempts that it began.
+    asked: VecDeque<Instant>,
 }
 
 impl Peer {
@@ -139,7 +140,7 @@ impl Peer {
             failures: 0,
             retry_at: is_wanted.then_some(now),
             why_not: NoDirectPath::First,
-            may_ask_at: None,
+            asked: VecDeque::new(),
         }
     }
 
@@ -229,10 +230,11 @@ impl DirectPaths {
         {
             return Some(attempt.offer());
         }
-        if peer.may_ask_at.is_some_and(|at| at > now) || (is_new && under_way >= DIRECT_ATTEMPTS_MAX) {
+        peer.asked.retain(|at| now.saturating_duration_since(*at) < ASKED_WITHIN);
+        if peer.asked.len() >= ASKED_MAX || (is_new && under_way >= DIRECT_ATTEMPTS_MAX) {
             return None;
         }
-        peer.may_ask_at = Some(now + ASKED_EVERY);
+        peer.asked.push_back(now);
         self.begin(now, node);
         let attempt = self.peers.get_mut(&node)?.attempt.as_mut()?;
         attempt.is_with(question.attempt).then(|| attempt.offer())

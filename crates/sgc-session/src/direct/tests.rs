@@ -308,6 +308,7 @@ fn peer_that_names_the_addresses_of_others_makes_nobody_send_more_than_it_did() 
     let named: Vec<_> = (0..sgc_wire::PATH_CANDIDATES_MAX as u16)
         .map(|n| PathCandidate { kind: CandidateKind::Host, place: victim(n).into() })
         .collect();
+    let mut refused = 0;
     for round in 0..20 {
         let (now, liar) = (world.now, world.sides[1].node);
         let machine = &mut world.sides[0].machine;
@@ -336,8 +337,10 @@ fn peer_that_names_the_addresses_of_others_makes_nobody_send_more_than_it_did() 
                 }
             }
         }
-        assert!(sent > 0 && sent <= sgc_wire::PATH_OFFER_BYTES, "{sent}");
+        refused += u32::from(sent == 0);
+        assert!(sent <= sgc_wire::PATH_OFFER_BYTES, "{sent}");
     }
+    assert!(refused > 0 && refused < 10, "{refused} of 20 rounds");
     assert!(world.sides[0].machine.refusals().0 > 0);
 }
 

@@ -13,6 +13,8 @@ use crate::{CALM, Pair, cable, can_run, is_long, turn};
 
 /// Number of tries in the long run for each pair of networks, unless `SGC_DIRECT_TRIES` has another.
 const TRIES_LONG: u32 = 200;
+/// Time between two of them: a node takes four attempts of a peer in ten seconds.
+const TRY_EVERY: Duration = Duration::from_millis(2700);
 /// Time in which a first attempt succeeds, from the start of the node on.
 const FIRST_ATTEMPT: Duration = Duration::from_secs(2);
 
@@ -50,6 +52,7 @@ fn try_often(lab: &Lab, pair: &mut Pair, what: &str) {
     let tries = std::env::var("SGC_DIRECT_TRIES").map_or(TRIES_LONG, |tries| tries.parse().unwrap());
     let mut soon = 0;
     for _ in 0..tries {
+        sleep(TRY_EVERY);
         pair.restart_desk(lab);
         let begun = Instant::now();
         eventually(&format!("a direct link, {what}"), || direct_links(&pair.desk) > 0);
