@@ -363,8 +363,9 @@ impl Joiner {
             (None, Some(JoinKind::Operate(_))) => cx.event(Event::OperationDenied { name, by }),
             (None, Some(JoinKind::Report(_))) => cx.event(Event::ReportRefused { name, by }),
             (None, Some(JoinKind::Path(_))) => {
-                let owner = self.joins.get(&name).map(Join::owner);
-                owner.into_iter().for_each(|peer| cx.event(Event::PathRefused { peer, by }));
+                if let Some(peer) = self.owner_of(&name) {
+                    cx.event(Event::PathRefused { peer, by });
+                }
             }
             // A missing description shows where it is needed.
             (None, Some(JoinKind::Types(_) | JoinKind::Consumers)) => {}

@@ -210,7 +210,7 @@ impl DirectPaths {
                 self.peers.entry(*node).or_insert_with(|| Peer::new(true, now));
             }
         }
-        // What failed is remembered until the peer may be tried again.
+        // A failure is remembered until the peer may be tried again.
         self.peers.retain(|_, peer| !peer.is_idle() || peer.retry_at.is_some_and(|at| at > now));
     }
 
@@ -386,8 +386,8 @@ impl DirectPaths {
     /// Lets an attempt go on, and passes on its results.
     fn advance(&mut self, now: Instant, node: NodeId) {
         let Some(attempt) = self.peers.get_mut(&node).and_then(|peer| peer.attempt.as_mut()) else { return };
-        let progress = attempt.advance(now, &mut self.withheld);
-        let Progress { sent, admitted, dialled } = progress;
+        let Progress { sent, admitted, dialled } = attempt.advance(now, &mut self.withheld);
+        let over = attempt.over(now);
         for (from, to, datagram) in sent {
             self.outputs.push_back(DirectOutput::Send { from, to, datagram });
         }
@@ -397,7 +397,6 @@ impl DirectPaths {
         if let Some(to) = dialled {
             self.outputs.push_back(DirectOutput::Dial { peer: node, to });
         }
-        let over = attempt.over(now);
         if let Some(why) = over {
             self.fail(now, node, why);
         }

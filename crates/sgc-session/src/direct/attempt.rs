@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use aws_lc_rs::hmac;
 use is::stun::{StunMessage, StunPacket};
-use is::{Candidate, IceAgent, IceAgentEvent, IceCreds, Protocol, Sha1HmacProvider};
+use is::{Candidate, IceAgent, IceAgentEvent, IceCreds, IceError, Protocol, Sha1HmacProvider};
 use rand_chacha::ChaCha20Rng;
 use sgc_wire::{CandidateKind, PATH_CANDIDATES_MAX, PATH_OFFER_BYTES, PathCandidate, PathOffer, SecretBytes};
 
@@ -89,13 +89,7 @@ impl Attempt {
         agent.set_max_stun_rto(CHECK_EVERY_MAX);
         let mut candidates = Vec::new();
         for local in local {
-            let candidate = match local.kind {
-                CandidateKind::Host => Candidate::host(local.base, Protocol::Udp),
-                CandidateKind::ServerReflexive => {
-                    Candidate::server_reflexive(local.address, local.base, Protocol::Udp)
-                }
-            };
-            if let Ok(candidate) = candidate {
+            if let Ok(candidate) = candidate(local.kind, local.address, local.base) {
                 agent.add_local_candidate(candidate);
                 candidates.push(PathCandidate { kind: local.kind, place: local.address.into() });
             }
@@ -148,13 +142,7 @@ impl Attempt {
         self.agent.set_remote_credentials(credentials(offer.user, &offer.password));
         for PathCandidate { kind, place } in &offer.candidates {
             let address = SocketAddr::from(*place);
-            let candidate = match kind {
-                CandidateKind::Host => Candidate::host(address, Protocol::Udp),
-                CandidateKind::ServerReflexive => {
-                    Candidate::server_reflexive(address, address, Protocol::Udp)
-                }
-            };
-            match candidate {
+            match candidate(*kind, address, address) {
                 Ok(candidate) if is_checkable(&address) => self.agent.add_remote_candidate(candidate),
                 _ => *refused += 1,
             }
@@ -184,7 +172,7 @@ impl Attempt {
             return;
         }
         self.sources.insert(from);
-        // What comes may cause as much again, and only an address that answers is known to be of the peer.
+        // A check may cause as many bytes as it has. Only an address that answers is known to be of the peer.
         self.allowance = self.allowance.saturating_add(bytes);
         if is_answer {
             self.answered.insert(from);
@@ -268,6 +256,14 @@ impl fmt::Debug for Attempt {
             .field("allowance", allowance)
             .field("nominated", nominated)
             .finish_non_exhaustive()
+    }
+}
+
+/// Returns a candidate for the agent. The base of a host's address is the address itself.
+fn candidate(kind: CandidateKind, address: SocketAddr, base: SocketAddr) -> Result<Candidate, IceError> {
+    match kind {
+        CandidateKind::Host => Candidate::host(base, Protocol::Udp),
+        CandidateKind::ServerReflexive => Candidate::server_reflexive(address, base, Protocol::Udp),
     }
 }
 
