@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_router::{FibEntry, Limits, LinkId, MappingKind, Neighbour, Output, Router, RouterConfig};
+use sgc_router::{
+    DirectReach, FibEntry, Limits, LinkId, LinkQuality, MappingKind, Neighbour, Output, Router, RouterConfig,
+};
 use sgc_testkit::{Clock, Member, identity, invited};
 use sgc_trust::{Identity, name_of, operations_blind};
 use sgc_wire::{
@@ -415,13 +417,54 @@ fn this_nodes_word_of_a_run_with_a_wrong_clock_is_overtaken() {
 fn a_link_that_fell_silent_is_left_where_there_is_another_way() {
     let mut bench = Bench::new();
     bench.with_owner_behind(5000, 9000);
-    bench.router.handle_link_quality(bench.clock.now(), LinkId(1), ms(1), true);
+    let silent = LinkQuality { round_trip: ms(1), is_silent: true, ..LinkQuality::default() };
+    bench.router.handle_link_quality(bench.clock.now(), LinkId(1), silent);
     bench.drain();
     bench.pass(ms(200));
     assert_eq!(bench.route(&A).map(|(link, _)| link), Some(2));
     bench.link_down(2);
     bench.pass(ms(200));
     assert_eq!(bench.route(&A).map(|(link, _)| link), Some(1), "it is better than none");
+}
+
+#[test]
+fn owner_adds_the_loss_of_a_direct_link_to_the_cost_that_it_tells_there() {
+    let mut bench = Bench::with_kind(MappingKind::Flood, Limits::default(), false);
+    let name = name_of(&bench.own.node_id(), &A);
+    bench.frame(0, bench.advert_of(&bench.own.clone(), 1, false, &[A]));
+    let desk = identity(&Member::new("desk"));
+    let far = Neighbour { direct: Some(DirectReach::Far), ..Neighbour::from(desk.as_peer()) };
+    bench.router.handle_link_up(bench.clock.now(), LinkId(5), far);
+    bench.frame(5, hello(5, false));
+    bench.frame(5, Control::Interest { names: vec![name] });
+    let told = |bench: &Bench| {
+        let costs = bench.sent.iter().filter_map(|(link, frame)| match frame {
+            Control::Advert { cost, .. } => Some((*link, *cost)),
+            _ => None,
+        });
+        costs.collect::<Vec<_>>()
+    };
+    assert_eq!(told(&bench), [(5, 0)]);
+    bench.sent.clear();
+    let mut sent_packets = 0;
+    let mut measure = |bench: &mut Bench, lost_packets| {
+        bench.clock.advance_to(bench.clock.instant() + Duration::from_secs(5));
+        sent_packets += 500;
+        let quality = LinkQuality { round_trip: ms(20), sent_packets, lost_packets, is_silent: false };
+        bench.router.handle_link_quality(bench.clock.now(), LinkId(5), quality);
+        bench.drain();
+        told(bench)
+    };
+    assert_eq!(measure(&mut bench, 0), []);
+    let lossy = measure(&mut bench, 100);
+    assert!(matches!(lossy[..], [(5, 30_000..)]), "{lossy:?}");
+    bench.sent.clear();
+    // It is not told again as long as it is about the same, and once it is over.
+    assert_eq!(measure(&mut bench, 150), []);
+    for _ in 0..5 {
+        measure(&mut bench, 150);
+    }
+    assert_eq!(told(&bench).last(), Some(&(5, 0)));
 }
 
 #[test]
@@ -1289,4 +1332,25 @@ fn the_loss_of_a_link_with_many_names_is_told_in_few_frames() {
         _ => None,
     });
     assert_eq!(told.collect::<Vec<_>>(), [(4, 4096), (4, 904)]);
+}
+
+#[test]
+fn proxy_moves_to_a_newer_link_to_the_same_neighbour() {
+    let mut bench = Bench::with_kind(MappingKind::Flood, Limits::default(), false);
+    let name = bench.name(&A);
+    bench.frame(0, Control::Interest { names: vec![name] });
+    let router = bench.routers[0].clone();
+    let advert = bench.advert_frame(1, false, &[A]);
+    bench.frame(1, advert.clone());
+    assert_eq!(bench.route(&A).map(|(link, _)| link), Some(1));
+    let neighbour = Neighbour { cost: Some(1000), ..Neighbour::from(router.as_peer()) };
+    bench.router.handle_link_up(bench.clock.now(), LinkId(7), neighbour);
+    // The same run.
+    bench.frame(7, hello(1, true));
+    // Not before the name is known there.
+    assert_eq!(bench.route(&A).map(|(link, _)| link), Some(1));
+    bench.frame(7, advert);
+    assert_eq!(bench.route(&A).map(|(link, _)| link), Some(7));
+    bench.link_down(7);
+    assert_eq!(bench.route(&A).map(|(link, _)| link), Some(1));
 }

@@ -105,12 +105,18 @@ pub enum NoDirectPath {
     /// Checks were answered, and no link came of it.
     #[error("packets pass, and no link was made")]
     NoLink,
+    /// There is a link, and nothing arrives over it.
+    #[error("nothing arrives over the direct link")]
+    Silent,
     /// There was a link, and it ended.
     #[error("the direct link ended")]
     Lost,
     /// This node has no address that a peer could reach.
     #[error("this node has no address that the peer could reach")]
     NoAddress,
+    /// One node has IPv4 alone, and the other IPv6 alone.
+    #[error("the two nodes have no address of one family: one has IPv4 alone, and the other IPv6 alone")]
+    NoCommonFamily,
     /// Too many attempts are under way.
     #[error("{DIRECT_ATTEMPTS_MAX} other attempts are under way")]
     Busy,
@@ -124,6 +130,8 @@ struct Peer {
     attempt: Option<Box<Attempt>>,
     /// Time since which a direct link is up.
     linked: Option<Instant>,
+    /// Whether nothing arrives over it.
+    is_silent: bool,
     failures: u32,
     retry_at: Option<Instant>,
     why_not: NoDirectPath,
@@ -137,6 +145,7 @@ impl Peer {
             is_wanted,
             attempt: None,
             linked: None,
+            is_silent: false,
             failures: 0,
             retry_at: is_wanted.then_some(now),
             why_not: NoDirectPath::First,
@@ -145,7 +154,17 @@ impl Peer {
     }
 
     fn is_idle(&self) -> bool {
-        !self.is_wanted && self.attempt.is_none() && self.linked.is_none()
+        !self.is_of_use() && self.attempt.is_none()
+    }
+
+    /// Returns `true` if this node exchanges data with it, or has a link to it.
+    fn is_of_use(&self) -> bool {
+        self.is_wanted || self.linked.is_some()
+    }
+
+    /// Returns `true` if a link carries data.
+    fn is_reached(&self) -> bool {
+        self.linked.is_some() && !self.is_silent
     }
 }
 
@@ -177,8 +196,8 @@ impl DirectPaths {
         }
     }
 
-    /// Sets the addresses of this node. If they changed, the network did: attempts begin anew, and those that wait are
-    /// due.
+    /// Sets the addresses of this node. If they changed, the network did: attempts begin anew, those that wait are due,
+    /// and a better path is looked for to peers with a link.
     pub fn set_local(&mut self, now: Instant, local: Vec<LocalAddress>) {
         if self.local == local {
             return;
@@ -189,7 +208,7 @@ impl DirectPaths {
             peer.failures = 0;
             if peer.attempt.is_some() {
                 under_way.push(*node);
-            } else if peer.linked.is_none() && peer.is_wanted {
+            } else if peer.is_of_use() {
                 peer.retry_at = Some(now);
             }
         }
@@ -200,7 +219,7 @@ impl DirectPaths {
     pub fn want(&mut self, now: Instant, wanted: &BTreeSet<NodeId>) {
         for (node, peer) in &mut self.peers {
             let is_wanted = wanted.contains(node);
-            if is_wanted && !peer.is_wanted && peer.linked.is_none() && peer.attempt.is_none() {
+            if is_wanted && !peer.is_of_use() && peer.attempt.is_none() {
                 peer.retry_at = Some(peer.retry_at.map_or(now, |at| at.max(now)));
             }
             peer.is_wanted = is_wanted;
@@ -248,6 +267,8 @@ impl DirectPaths {
         if !attempt.take_offer(now, offer, &mut self.refused_candidates) {
             // The peer began anew in between.
             self.begin(now, node);
+        } else if !attempt.shares_family(offer) {
+            return self.fail(now, node, NoDirectPath::NoCommonFamily);
         }
         self.advance(now, node);
     }
@@ -285,15 +306,31 @@ impl DirectPaths {
         if peer.attempt.take().is_some() {
             self.outputs.push_back(DirectOutput::Leave { peer: node });
         }
-        (peer.linked, peer.retry_at) = (Some(now), None);
+        (peer.linked, peer.is_silent, peer.retry_at) = (Some(now), false, None);
+    }
+
+    /// Notes whether nothing arrives over all direct links to a peer. Its address may be another one now.
+    pub fn silent(&mut self, now: Instant, node: NodeId, is_silent: bool) {
+        let Some(peer) = self.peers.get_mut(&node).filter(|peer| peer.linked.is_some()) else { return };
+        if std::mem::replace(&mut peer.is_silent, is_silent) == is_silent {
+            return;
+        }
+        peer.retry_at = (is_silent && peer.attempt.is_none()).then_some(now);
+        if is_silent {
+            peer.why_not = NoDirectPath::Silent;
+        }
     }
 
     /// Notes that the last direct link to a peer ended.
     pub fn ended(&mut self, now: Instant, node: NodeId) {
         let Some(peer) = self.peers.get_mut(&node) else { return };
         let Some(since) = peer.linked.take() else { return };
-        self.outputs.push_back(DirectOutput::Shut { peer: node });
+        peer.is_silent = false;
         peer.why_not = NoDirectPath::Lost;
+        if peer.attempt.is_some() {
+            return;
+        }
+        self.outputs.push_back(DirectOutput::Shut { peer: node });
         let is_proven = now.saturating_duration_since(since) >= LINK_PROVEN_AFTER;
         peer.failures = if is_proven { 1 } else { peer.failures.saturating_add(1) };
         let wait = doubled(RETRY_MIN, peer.failures, RETRY_MAX, &mut self.rng);
@@ -310,10 +347,7 @@ impl DirectPaths {
     /// Acts on timers that are due.
     pub fn handle_timeout(&mut self, now: Instant) {
         let due = |peer: &Peer| {
-            peer.attempt.is_none()
-                && peer.is_wanted
-                && peer.linked.is_none()
-                && peer.retry_at.is_some_and(|at| at <= now)
+            peer.attempt.is_none() && peer.is_of_use() && peer.retry_at.is_some_and(|at| at <= now)
         };
         let begin: Vec<_> = self.peers.iter().filter(|(_, peer)| due(peer)).map(|(node, _)| *node).collect();
         for node in begin {
@@ -336,7 +370,7 @@ impl DirectPaths {
     pub fn deadline(&mut self) -> Option<Instant> {
         let times = self.peers.values_mut().filter_map(|peer| match &mut peer.attempt {
             Some(attempt) => Some(attempt.deadline()),
-            None => peer.retry_at.filter(|_| peer.is_wanted && peer.linked.is_none()),
+            None => peer.retry_at.filter(|_| peer.is_of_use()),
         });
         times.min()
     }
@@ -348,7 +382,7 @@ impl DirectPaths {
 
     /// Iterates over the peers with which data is exchanged and to which there is no direct path, with the reason.
     pub fn relayed(&self) -> impl Iterator<Item = (NodeId, NoDirectPath)> {
-        let relayed = self.peers.iter().filter(|(_, peer)| peer.is_wanted && peer.linked.is_none());
+        let relayed = self.peers.iter().filter(|(_, peer)| peer.is_wanted && !peer.is_reached());
         relayed.map(|(node, peer)| (*node, peer.why_not))
     }
 
@@ -412,6 +446,11 @@ impl DirectPaths {
     fn wait(&mut self, now: Instant, node: NodeId, why: NoDirectPath) {
         let Some(peer) = self.peers.get_mut(&node) else { return };
         peer.attempt = None;
+        if peer.is_reached() {
+            // The link stays. A better path is looked for when the network changes again.
+            peer.retry_at = None;
+            return;
+        }
         peer.failures = peer.failures.saturating_add(1);
         peer.why_not = why;
         peer.retry_at = Some(now + doubled(RETRY_MIN, peer.failures, RETRY_MAX, &mut self.rng));

@@ -9,7 +9,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use sgc_router::{LinkId, MappingKind, Output};
+use sgc_router::{LinkId, LinkQuality, MappingKind, Output};
 use sgc_testkit::mesh::{BATCH_NAMES, Mesh, Tally};
 use sgc_testkit::{CountingAllocator, Member, identity, live_bytes};
 use sgc_trust::verify_link_state;
@@ -214,7 +214,8 @@ fn search_time(mesh: &mut Mesh) -> Duration {
         instant += Duration::from_millis(200);
         unix.0 += 200;
         let now = Now { instant, unix };
-        router.handle_link_quality(now, LinkId(1), Duration::ZERO, n % 2 == 0);
+        let quality = LinkQuality { is_silent: n % 2 == 0, ..LinkQuality::default() };
+        router.handle_link_quality(now, LinkId(1), quality);
         while !matches!(router.poll_output(), Output::Timeout(_)) {}
         router.handle_timeout(now);
         while !matches!(router.poll_output(), Output::Timeout(_)) {}

@@ -2,6 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+use super::loss::Loss;
+use super::quality::LinkQuality;
+
 /// Cost of every link besides its round trip: of equally quick routes, the one with fewer links is better.
 const COST_OF_LINK: u32 = 1000;
 /// Cost of a link whose round trip is not known.
@@ -32,26 +35,33 @@ pub(crate) struct Cost {
     differs_since: Option<Instant>,
     /// Set while nothing at all arrives over the link.
     suspect: bool,
-    /// A direct link is taken unless it is clearly worse than a path over routers.
-    is_direct: bool,
+    /// Set for a direct link, which is taken unless it is clearly worse than a path over routers.
+    direct: Option<Loss>,
 }
 
 impl Cost {
     pub(crate) fn new(set: Option<u32>) -> Self {
-        Self { set, smoothed: None, counts: None, differs_since: None, suspect: false, is_direct: false }
+        Self { set, smoothed: None, counts: None, differs_since: None, suspect: false, direct: None }
     }
 
     /// Returns the cost of a direct link.
     pub(crate) fn of_direct_link() -> Self {
-        Self { is_direct: true, ..Self::new(None) }
+        Self { direct: Some(Loss::default()), ..Self::new(None) }
     }
 
     /// Returns the present cost.
     pub(crate) fn now(&self) -> u32 {
         let measured = || self.counts.map_or(COST_UNKNOWN, |rtt| rtt.saturating_add(COST_OF_LINK));
         let cost = self.set.unwrap_or_else(measured);
-        let cost = if self.is_direct { cost - cost / COST_PART } else { cost };
+        let cost = if self.direct.is_some() { cost - cost / COST_PART } else { cost };
+        let cost = cost.saturating_add(self.of_loss());
         if self.suspect { cost.saturating_add(COST_SUSPECT) } else { cost }
+    }
+
+    /// Returns the part of the cost that is due to lost packets; 0 unless it is a direct link.
+    pub(crate) fn of_loss(&self) -> u32 {
+        let round_trip = self.counts.unwrap_or(COST_UNKNOWN).saturating_add(COST_OF_LINK);
+        self.direct.as_ref().map_or(0, |loss| loss.cost(round_trip)).min(COST_SUSPECT / 2)
     }
 
     /// Returns `true` while nothing at all arrives over the link.
@@ -60,10 +70,14 @@ impl Cost {
     }
 
     /// Takes a measurement. Returns `true` if it changes the cost.
-    pub(crate) fn measure(&mut self, now: Instant, rtt: Duration, suspect: bool) -> bool {
+    pub(crate) fn measure(&mut self, now: Instant, quality: LinkQuality) -> bool {
+        let LinkQuality { round_trip, is_silent, sent_packets, lost_packets } = quality;
         let before = self.now();
-        self.suspect = suspect;
-        let rtt = u32::try_from(rtt.as_micros()).unwrap_or(u32::MAX).min(COST_SUSPECT / 2);
+        self.suspect = is_silent;
+        if let Some(loss) = &mut self.direct {
+            loss.measure(now, sent_packets, lost_packets);
+        }
+        let rtt = u32::try_from(round_trip.as_micros()).unwrap_or(u32::MAX).min(COST_SUSPECT / 2);
         let smoothed = self.smoothed.map_or(rtt, |old| old - old / 8 + rtt / 8);
         self.smoothed = Some(smoothed);
         let counts = *self.counts.get_or_insert(smoothed);
@@ -85,23 +99,29 @@ mod tests {
         Duration::from_millis(n)
     }
 
+    impl Cost {
+        fn measure_rtt(&mut self, now: Instant, round_trip: Duration, is_silent: bool) -> bool {
+            self.measure(now, LinkQuality { round_trip, is_silent, ..LinkQuality::default() })
+        }
+    }
+
     #[test]
     fn jitter_does_not_move_a_cost_and_a_lasting_change_does() {
         #[allow(clippy::disallowed_methods)]
         let start = Instant::now();
         let mut cost = Cost::new(None);
         assert_eq!(cost.now(), COST_UNKNOWN);
-        assert!(cost.measure(start, ms(20), false));
+        assert!(cost.measure_rtt(start, ms(20), false));
         let first = cost.now();
         assert_eq!(first, 20_000 + COST_OF_LINK);
         for n in 0..600 {
             let rtt = ms([12, 30, 21, 19, 25, 14][n as usize % 6]);
-            assert!(!cost.measure(start + ms(100 * n), rtt, false), "moved by jitter");
+            assert!(!cost.measure_rtt(start + ms(100 * n), rtt, false), "moved by jitter");
         }
         let later = start + ms(60_000);
-        let moved = (0..600).find(|n| cost.measure(later + ms(100 * n), ms(60), false)).unwrap();
+        let moved = (0..600).find(|n| cost.measure_rtt(later + ms(100 * n), ms(60), false)).unwrap();
         assert!(moved * 100 >= 5000, "moved after {moved} tenths of a second");
-        assert!(cost.now() > 2 * first && (0..600).all(|n| !cost.measure(later + ms(n), ms(60), false)));
+        assert!(cost.now() > 2 * first && (0..600).all(|n| !cost.measure_rtt(later + ms(n), ms(60), false)));
     }
 
     #[test]
@@ -110,17 +130,37 @@ mod tests {
         let start = Instant::now();
         for rtt in [1, 20, 300] {
             let mut direct = Cost::of_direct_link();
-            direct.measure(start, ms(rtt), false);
+            direct.measure_rtt(start, ms(rtt), false);
             let mut relayed = Cost::new(None);
-            relayed.measure(start, ms(rtt), false);
+            relayed.measure_rtt(start, ms(rtt), false);
             assert!(direct.now() < relayed.now() && cost_differs(relayed.now(), direct.now()), "{rtt} ms");
         }
         let mut direct = Cost::of_direct_link();
-        direct.measure(start, ms(100), false);
+        direct.measure_rtt(start, ms(100), false);
         let mut relayed = Cost::new(None);
-        relayed.measure(start, ms(40), false);
+        relayed.measure_rtt(start, ms(40), false);
         assert!(relayed.now() < direct.now() && cost_differs(direct.now(), relayed.now()));
-        assert!(direct.measure(start, ms(100), true) && direct.now() > COST_SUSPECT);
+        assert!(direct.measure_rtt(start, ms(100), true) && direct.now() > COST_SUSPECT);
+    }
+
+    #[test]
+    fn direct_link_that_loses_a_fifth_gives_way_to_a_path_of_twice_its_round_trip() {
+        #[allow(clippy::disallowed_methods)]
+        let start = Instant::now();
+        let mut direct = Cost::of_direct_link();
+        let mut relayed = Cost::new(None);
+        for second in 0..10 {
+            let lossy = LinkQuality {
+                round_trip: ms(20),
+                sent_packets: 100 * second,
+                lost_packets: 20 * second,
+                ..LinkQuality::default()
+            };
+            direct.measure(start + ms(1000 * second), lossy);
+            relayed.measure(start + ms(1000 * second), LinkQuality { round_trip: ms(40), ..lossy });
+        }
+        assert_eq!(relayed.of_loss(), 0);
+        assert!(relayed.now() < direct.now() && cost_differs(direct.now(), relayed.now()));
     }
 
     #[test]
@@ -128,9 +168,9 @@ mod tests {
         #[allow(clippy::disallowed_methods)]
         let start = Instant::now();
         let mut cost = Cost::new(Some(7));
-        assert!(!cost.measure(start, ms(900), false));
+        assert!(!cost.measure_rtt(start, ms(900), false));
         assert_eq!(cost.now(), 7);
-        assert!(cost.measure(start, ms(900), true) && cost.now() == 7 + COST_SUSPECT);
-        assert!(cost.measure(start, ms(900), false) && cost.now() == 7);
+        assert!(cost.measure_rtt(start, ms(900), true) && cost.now() == 7 + COST_SUSPECT);
+        assert!(cost.measure_rtt(start, ms(900), false) && cost.now() == 7);
     }
 }

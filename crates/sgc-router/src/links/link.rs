@@ -7,6 +7,7 @@ use sgc_trust::{CertId, VerifiedPeer};
 use sgc_wire::{Hello, NodeId, Now, PeerClock, UnixMillis};
 
 use crate::links::cost::Cost;
+use crate::links::quality::LinkQuality;
 
 /// The node at the other end of a link, as the handshake proved it.
 #[derive(Clone, Debug)]
@@ -157,8 +158,8 @@ impl Link {
     }
 
     /// Takes a measurement. Returns `true` if it changes the cost.
-    pub(super) fn measure(&mut self, now: Instant, round_trip: Duration, suspect: bool) -> bool {
-        self.cost.measure(now, round_trip, suspect)
+    pub(super) fn measure(&mut self, now: Instant, quality: LinkQuality) -> bool {
+        self.cost.measure(now, quality)
     }
 
     /// Takes a report of the neighbour's wall clock, and returns the one before.

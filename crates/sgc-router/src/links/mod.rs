@@ -4,6 +4,8 @@
 
 pub(crate) mod cost;
 mod link;
+mod loss;
+mod quality;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -14,6 +16,7 @@ use smallvec::SmallVec;
 
 pub(crate) use self::link::Link;
 pub use self::link::{DirectReach, Neighbour};
+pub use self::quality::LinkQuality;
 use crate::link_id::LinkId;
 use crate::output::LinkClose;
 
@@ -191,6 +194,11 @@ impl Links {
         self.links.get(&link).map(|state| state.cost().now())
     }
 
+    /// Returns the part of a link's cost that is due to packets which this end sent and which were lost.
+    pub(crate) fn cost_of_loss(&self, link: LinkId) -> u32 {
+        self.links.get(&link).map_or(0, |state| state.cost().of_loss())
+    }
+
     /// Iterates over all links, ascending.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (LinkId, &Link)> {
         self.links.iter().map(|(link, state)| (*link, state))
@@ -248,15 +256,9 @@ impl Links {
     // ---- Measurements, clocks and certificates.
 
     /// Takes a measurement of a link. Returns the node at its other end if the cost changed.
-    pub(crate) fn measure(
-        &mut self,
-        now: Instant,
-        link: LinkId,
-        round_trip: Duration,
-        suspect: bool,
-    ) -> Option<NodeId> {
+    pub(crate) fn measure(&mut self, now: Instant, link: LinkId, quality: LinkQuality) -> Option<NodeId> {
         let state = self.links.get_mut(&link)?;
-        state.measure(now, round_trip, suspect).then_some(*state.node())
+        state.measure(now, quality).then_some(*state.node())
     }
 
     /// Takes the time of a neighbour's wall clock. Returns `true` if the clocks of the two nodes no longer differ as

@@ -59,7 +59,15 @@ impl Heard {
     /// Returns the link towards the owner of a name, and the cost of the route.
     pub(super) fn next_hop(&self, links: &Links, name: &Name) -> Option<(LinkId, u32)> {
         let heard = self.names.get(name)?;
-        let over = |(link, cost): &(LinkId, u32)| Some((cost.saturating_add(links.cost(*link)?), *link));
+        // Of several links to one neighbour, data moves to the best, even if that is no cheaper.
+        let is_passed_over = |link: LinkId| {
+            let best = links.get(link).and_then(|state| links.best_to(state.node()));
+            best.is_some_and(|(best, _)| best != link && heard.over.iter().any(|(l, _)| *l == best))
+        };
+        let over = |(link, cost): &(LinkId, u32)| {
+            let cost = cost.saturating_add(links.cost(*link)?);
+            (!is_passed_over(*link)).then_some((cost, *link))
+        };
         let best = heard.over.iter().filter_map(over).min()?;
         // Another link is taken only if that is clearly better.
         let kept = heard.over.iter().filter(|(l, _)| Some(*l) == heard.selected).find_map(over);

@@ -279,14 +279,23 @@ impl Names {
         self.tell_interested(cx, link, &names);
     }
 
+    /// Tells an interested neighbour the names of its interest if their cost changed with the loss of the link.
+    pub(crate) fn loss_changed(&mut self, cx: &mut Context<'_>, link: LinkId) {
+        let names = self.interests.names(link);
+        self.tell_interested(cx, link, &names);
+    }
+
     /// Tells an interested neighbour the news of these names: each advertisement once.
     fn tell_interested(&mut self, cx: &mut Context<'_>, link: LinkId, names: &[Name]) {
+        // The neighbour measures the packets that it sends, and these are the others.
+        let of_loss = cx.network.links.cost_of_loss(link);
         let mut adverts = BTreeMap::new();
         let mut gone = Vec::new();
         for name in names {
             let Some(told) = self.interests.told(link, name) else { continue };
             let is_told = |next_hop| self.may_tell(next_hop, link) && !self.withheld.contains(&(link, *name));
             let next_hop = self.next_hop(cx.network, name).filter(|(next_hop, _)| is_told(*next_hop));
+            let next_hop = next_hop.map(|(next_hop, cost)| (next_hop, cost.saturating_add(of_loss)));
             let id = self.records.id(name);
             let news = match (told, next_hop.zip(id)) {
                 (None, None) => continue,

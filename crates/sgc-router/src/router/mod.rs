@@ -11,7 +11,7 @@ mod sync;
 mod trust;
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use sgc_trust::Identity;
 use sgc_wire::{ClockWatch, Control, Hello, MINOR_VERSION, Name, NodeId, Now};
@@ -23,7 +23,7 @@ use crate::context::Context;
 use crate::drops::DropReason;
 use crate::limits::allowances::Allowances;
 use crate::link_id::LinkId;
-use crate::links::{Link, Links, Neighbour};
+use crate::links::{Link, LinkQuality, Links, Neighbour};
 use crate::names::Names;
 use crate::network::Network;
 use crate::output::{LinkClose, Output, Outputs};
@@ -115,12 +115,15 @@ impl Router {
         self.forget_link(link);
     }
 
-    /// Takes the measurements of a link: its round trip, and whether nothing at all arrives although something should.
-    /// Such a link is used only where there is no other route.
-    pub fn handle_link_quality(&mut self, now: Now, link: LinkId, round_trip: Duration, suspect: bool) {
+    /// Takes the measurements of a link.
+    pub fn handle_link_quality(&mut self, now: Now, link: LinkId, quality: LinkQuality) {
         self.now = now;
-        if let Some(node) = self.links.measure(now.instant, link, round_trip, suspect) {
+        let of_loss = self.links.cost_of_loss(link);
+        if let Some(node) = self.links.measure(now.instant, link, quality) {
             self.topology.links_changed(now.instant, &node);
+        }
+        if self.links.cost_of_loss(link) != of_loss {
+            self.names_part(|names, cx| names.loss_changed(cx, link));
         }
     }
 
@@ -284,6 +287,12 @@ impl Router {
     /// Returns `true` if a branch of some name uses a link, or the node there is interested in a name of this one.
     pub fn is_used(&self, link: LinkId) -> bool {
         self.trees.uses(link) || self.names.wants_own(link)
+    }
+
+    /// Returns `true` if another link to the same node is better, and no branch uses this one.
+    pub fn is_superseded(&self, link: LinkId) -> bool {
+        let best = self.links.get(link).and_then(|state| self.links.best_to(state.node()));
+        best.is_some_and(|(best, _)| best != link) && !self.trees.uses(link)
     }
 
     /// Returns the cost of a link, microseconds of round trip, and whether it seems dead.

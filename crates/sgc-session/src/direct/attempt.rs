@@ -1,12 +1,12 @@
 //! One attempt to find a path to a peer.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use aws_lc_rs::hmac;
-use is::stun::{StunMessage, StunPacket};
+use is::stun::{StunMessage, StunPacket, TransId};
 use is::{Candidate, IceAgent, IceAgentEvent, IceCreds, IceError, Protocol, Sha1HmacProvider};
 use rand_chacha::ChaCha20Rng;
 use sgc_wire::{CandidateKind, PATH_CANDIDATES_MAX, PATH_OFFER_BYTES, PathCandidate, PathOffer, SecretBytes};
@@ -25,6 +25,11 @@ const PAIRS_MAX: usize = 64;
 const SOURCES_MAX: usize = 32;
 /// Time for a better pair to answer, after one did.
 const SETTLE: Duration = Duration::from_millis(60);
+/// Most checks whose answers are measured.
+const CHECKS_MEASURED_MAX: usize = 256;
+/// An address with a shorter round trip is taken instead of the agent's choice if that one's is longer by a quarter and
+/// by this.
+const CLEARLY_LONGER: Duration = Duration::from_millis(1);
 
 /// HMAC-SHA1 for the agent, as RFC 8489 demands.
 #[derive(Debug)]
@@ -54,11 +59,13 @@ pub(super) struct Attempt {
     until: Instant,
     /// Bytes that may still be sent to addresses that have not answered.
     allowance: usize,
-    /// Addresses that answered a check, and so are of the peer.
-    answered: BTreeSet<SocketAddr>,
+    /// Checks under way, with their times.
+    checks: BTreeMap<TransId, Instant>,
+    /// Addresses that answered a check, and so are of the peer, with the shortest round trip.
+    answered: BTreeMap<SocketAddr, Duration>,
     /// Addresses from which authentic checks came. Their senders may have forged them.
     sources: BTreeSet<SocketAddr>,
-    /// The best address of the peer so far, and the time from which it is used.
+    /// The address of the peer that the agent prefers, and the time from which an address is dialled.
     nominated: Option<(SocketAddr, Instant)>,
     dialled: Option<SocketAddr>,
     admitted: BTreeSet<SocketAddr>,
@@ -107,7 +114,8 @@ impl Attempt {
             is_controlling,
             until: now + DIRECT_ATTEMPT_MAX,
             allowance: 0,
-            answered: BTreeSet::new(),
+            checks: BTreeMap::new(),
+            answered: BTreeMap::new(),
             sources: BTreeSet::new(),
             nominated: None,
             dialled: None,
@@ -151,6 +159,17 @@ impl Attempt {
         true
     }
 
+    /// Returns `true` if an address of the peer and one of this node are both of IPv4, or both of IPv6. A peer without
+    /// addresses may still send checks.
+    pub(super) fn shares_family(&self, offer: &PathOffer) -> bool {
+        let has = |candidates: &[PathCandidate], is_v4| {
+            candidates.iter().any(|candidate| SocketAddr::from(candidate.place).is_ipv4() == is_v4)
+        };
+        let shares =
+            [true, false].iter().any(|is_v4| has(&self.candidates, *is_v4) && has(&offer.candidates, *is_v4));
+        shares || offer.candidates.is_empty()
+    }
+
     /// Returns `true` if a check is of this attempt.
     pub(super) fn accepts(&self, message: &StunMessage<'_>) -> bool {
         self.agent.accepts_message(message)
@@ -166,7 +185,7 @@ impl Attempt {
         if self.sources.len() >= SOURCES_MAX && !self.sources.contains(&from) {
             return;
         }
-        let is_answer = message.is_successful_binding_response();
+        let answers = message.is_successful_binding_response().then(|| message.trans_id());
         let packet = StunPacket { proto: Protocol::Udp, source: from, destination: to, message };
         if !self.agent.handle_packet(now, packet) {
             return;
@@ -174,8 +193,10 @@ impl Attempt {
         self.sources.insert(from);
         // A check may cause as many bytes as it has. Only an address that answers is known to be of the peer.
         self.allowance = self.allowance.saturating_add(bytes);
-        if is_answer {
-            self.answered.insert(from);
+        if let Some(sent) = answers.and_then(|id| self.checks.remove(&id)) {
+            let round_trip = now.saturating_duration_since(sent);
+            let shortest = self.answered.entry(from).or_insert(round_trip);
+            *shortest = round_trip.min(*shortest);
         }
     }
 
@@ -197,12 +218,16 @@ impl Attempt {
         while let Some(transmit) = self.agent.poll_transmit() {
             let (from, to) = (transmit.source, transmit.destination);
             let datagram = Vec::from(transmit.contents);
-            if !self.answered.contains(&to) {
+            if !self.answered.contains_key(&to) {
                 let Some(left) = self.allowance.checked_sub(datagram.len()) else {
                     *withheld += 1;
                     continue;
                 };
                 self.allowance = left;
+            }
+            let check = StunMessage::parse(&datagram).ok().filter(StunMessage::is_binding_request);
+            if let Some(check) = check.filter(|_| self.checks.len() < CHECKS_MEASURED_MAX) {
+                self.checks.insert(check.trans_id(), now);
             }
             progress.sent.push((from, to, datagram));
         }
@@ -223,10 +248,22 @@ impl Attempt {
         }
         let nominated = self.nominated.filter(|(_, from)| self.is_controlling && *from <= now);
         if let Some((address, _)) = nominated.filter(|_| self.dialled.is_none()) {
+            let address = self.quickest(address);
             self.dialled = Some(address);
             progress.dialled = Some(address);
         }
         progress
+    }
+
+    /// Returns the address with the shortest round trip, or the agent's choice if that is about as quick.
+    fn quickest(&self, nominated: SocketAddr) -> SocketAddr {
+        let shortest = self.answered.iter().min_by_key(|(_, round_trip)| **round_trip);
+        let Some((address, round_trip)) = shortest else { return nominated };
+        let limit = *round_trip + (*round_trip / 4).max(CLEARLY_LONGER);
+        match self.answered.get(&nominated) {
+            Some(of_nominated) if *of_nominated <= limit => nominated,
+            _ => *address,
+        }
     }
 
     /// Returns why the attempt failed, if it did.

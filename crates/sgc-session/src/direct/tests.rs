@@ -50,6 +50,8 @@ struct Side {
     node: NodeId,
     machine: DirectPaths,
     inside: SocketAddr,
+    /// The address in a second network.
+    second: Option<SocketAddr>,
     outside: IpAddr,
     nat: Option<Nat>,
     /// Port outside for each key of the mapping.
@@ -75,6 +77,7 @@ impl Side {
             node,
             machine: DirectPaths::new(node, ChaCha20Rng::seed_from_u64(id.into())),
             inside,
+            second: None,
             outside,
             nat,
             mapped: BTreeMap::new(),
@@ -98,7 +101,7 @@ impl Side {
     /// Returns `true` if a packet to `to` reaches the node.
     fn lets_in(&self, from: SocketAddr, to: SocketAddr) -> bool {
         match self.nat {
-            None => to == self.inside,
+            None => to == self.inside || self.second == Some(to),
             Some(nat) => {
                 to.ip() == self.outside
                     && self.mapped.values().any(|port| *port == to.port())
@@ -123,6 +126,8 @@ struct World {
     /// Decides which packets are lost, if some are: a third of them.
     loss: ChaCha20Rng,
     is_lossy: bool,
+    /// An address to which packets take ten times as long.
+    slow: Option<SocketAddr>,
     count: usize,
     linked: Option<Duration>,
 }
@@ -140,6 +145,7 @@ impl World {
             signals: Vec::new(),
             loss: ChaCha20Rng::seed_from_u64(0),
             is_lossy: false,
+            slow: None,
             count: 0,
             linked: None,
         };
@@ -179,13 +185,15 @@ impl World {
                     }
                     DirectOutput::Dial { to, .. } => self.sides[at].dialled = Some(to),
                     DirectOutput::Send { from, to, datagram } => {
-                        assert_eq!(from, self.sides[at].inside);
-                        *self.sides[at].bytes_to.entry(to).or_default() += datagram.len();
-                        let source = self.sides[at].map(to);
+                        let side = &mut self.sides[at];
+                        assert!(from == side.inside || side.second == Some(from));
+                        *side.bytes_to.entry(to).or_default() += datagram.len();
+                        let source = if side.nat.is_some() { side.map(to) } else { from };
                         self.count += 1;
                         let is_lost = self.is_lossy && self.loss.next_u32().is_multiple_of(3);
                         if !is_lost {
-                            self.packets.push((self.now + PACKETS, 1 - at, source, to, datagram));
+                            let delay = if self.slow == Some(to) { 10 * PACKETS } else { PACKETS };
+                            self.packets.push((self.now + delay, 1 - at, source, to, datagram));
                         }
                     }
                 }
@@ -216,7 +224,8 @@ impl World {
         for (_, at, from, to, datagram) in arrived {
             let side = &mut self.sides[at];
             if side.lets_in(from, to) {
-                side.machine.received(now, side.inside, from, &datagram);
+                let to = if side.nat.is_some() { side.inside } else { to };
+                side.machine.received(now, to, from, &datagram);
             }
         }
         let arrived = self.signals.extract_if(.., |(at, ..)| *at <= now).collect::<Vec<_>>();
@@ -473,6 +482,76 @@ fn address_that_becomes_known_in_the_middle_of_an_attempt_is_used_at_once() {
         world.run(Duration::from_millis(600));
         assert!(world.linked.is_some(), "{late}");
     }
+}
+
+#[test]
+fn quicker_of_two_paths_is_dialled() {
+    for is_first_slow in [true, false] {
+        let mut world = World::new([None, None]);
+        let desk = &mut world.sides[1];
+        let (first, second) = (desk.inside, SocketAddr::from(([203, 0, 113, 77], PORT)));
+        desk.second = Some(second);
+        let host = |address| LocalAddress { kind: CandidateKind::Host, address, base: address };
+        desk.machine.set_local(world.now, vec![host(first), host(second)]);
+        let (slow, quick) = if is_first_slow { (first, second) } else { (second, first) };
+        world.slow = Some(slow);
+        world.want(0);
+        let mut dialled = None;
+        while world.now < world.begun + DIRECT_ATTEMPT_MAX && dialled.is_none() {
+            world.step();
+            dialled = world.sides[0].dialled;
+        }
+        assert_eq!(dialled, Some(quick));
+    }
+}
+
+#[test]
+fn better_path_is_looked_for_when_addresses_change_while_the_link_stays() {
+    let mut world = World::new([None, None]);
+    world.want(0);
+    world.run(Duration::from_secs(1));
+    assert!(world.linked.take().is_some());
+    world.sides[0].dialled = None;
+    let far = world.sides[1].node;
+    let dials = |world: &mut World| {
+        world.sides[0].machine.set_local(world.now, Vec::new());
+        let inside = world.sides[0].inside;
+        let host = LocalAddress { kind: CandidateKind::Host, address: inside, base: inside };
+        world.sides[0].machine.set_local(world.now, vec![host]);
+        world.run(DIRECT_ATTEMPT_MAX + Duration::from_secs(1));
+        world.sides[0].dialled = None;
+        world.linked.take().is_some()
+    };
+    assert!(dials(&mut world));
+    // One attempt that fails. The link stays, and nothing more is tried.
+    world.sides[1].permits = false;
+    assert!(!dials(&mut world));
+    assert_eq!(world.why_not(0), None);
+    assert_eq!(world.sides[0].machine.deadline(), None);
+    // The old link ends during an attempt, whose link is still awaited.
+    world.sides[1].permits = true;
+    world.sides[0].machine.set_local(world.now, Vec::new());
+    let inside = world.sides[0].inside;
+    let host = LocalAddress { kind: CandidateKind::Host, address: inside, base: inside };
+    world.sides[0].machine.set_local(world.now, vec![host]);
+    world.run(Duration::from_millis(50));
+    world.sides[0].machine.ended(world.now, far);
+    let near = world.sides[0].node;
+    world.sides[1].machine.ended(world.now, near);
+    world.run(Duration::from_secs(1));
+    assert!(world.linked.is_some());
+}
+
+#[test]
+fn nodes_without_an_address_of_one_family_give_up_at_once() {
+    let mut world = World::new([None, None]);
+    let address = "[2001:db8::7]:5000".parse().unwrap();
+    let v6 = LocalAddress { kind: CandidateKind::Host, address, base: address };
+    world.sides[0].machine.set_local(world.now, vec![v6]);
+    world.want(1);
+    world.run(Duration::from_millis(200));
+    assert_eq!(world.why_not(1), Some(NoDirectPath::NoCommonFamily));
+    assert_eq!(world.count, 0);
 }
 
 #[test]

@@ -16,7 +16,7 @@ use sgc_endpoint::{
     AskAgain, Delivery, Endpoint, EndpointConfig, Event, JoinKind, JoinStatus, Marks, Message,
     RecoveryLimits, ShareSpec, Sink, SinkDrop, SinkLimits, Source, SourceConfig,
 };
-use sgc_router::{FibEntry, LinkClose, LinkId, MappingKind, Neighbour, Router, RouterConfig};
+use sgc_router::{FibEntry, LinkClose, LinkId, LinkQuality, MappingKind, Neighbour, Router, RouterConfig};
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
@@ -300,7 +300,8 @@ impl Running {
                 self.link_down(now, link);
             }
             Arrival::Quality(link, round_trip, suspect) => {
-                self.router.handle_link_quality(now, link, round_trip, suspect);
+                let quality = LinkQuality { round_trip, is_silent: suspect, ..LinkQuality::default() };
+                self.router.handle_link_quality(now, link, quality);
             }
         }
     }

@@ -83,8 +83,7 @@ impl<N: RosNetwork> Core<N> {
         let reached: BTreeSet<_> = configured.map(|(_, entry)| entry.peer().node_id).collect();
         let owners = self.endpoint.data_owners().filter(|owner| !reached.contains(&owner.node_id));
         self.direct.want(at, owners);
-        let router = &self.router;
-        for link in self.direct.unused(at, |link| router.is_used(link)) {
+        for link in self.direct.unused(at, &self.router) {
             self.links.close(link, "nothing uses the direct link".to_owned(), CloseReason::Goodbye);
         }
     }

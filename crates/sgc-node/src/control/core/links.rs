@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::time::Instant;
 
 use sgc_ros::RosNetwork;
-use sgc_router::{DropReason, LinkId, Neighbour};
+use sgc_router::{DropReason, LinkId, LinkQuality, Neighbour};
 use sgc_transport::{AnyLink, CloseReason, Link, LinkUrl};
 use sgc_trust::VerifiedPeer;
 use sgc_wire::{Control, MINOR_OBSERVED_ADDRESS, NodeId, Place};
@@ -14,7 +14,7 @@ use tracing::{debug, info, warn};
 use super::Core;
 use crate::clock::now;
 use crate::control::event::LinkPlace;
-use crate::control::parts::link_table::{EndedLink, LinkMeasurement};
+use crate::control::parts::link_table::EndedLink;
 use crate::control::peers::control_queue::FrameRoom;
 use crate::data::stats::CountDrops;
 use crate::link::control_tx::ControlTx;
@@ -35,7 +35,7 @@ impl<N: RosNetwork> Core<N> {
         self.hear_of(link.peer());
         let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
         self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
-        let rtt = link.stats().rtt;
+        let quality = LinkQuality { round_trip: link.stats().rtt, ..LinkQuality::default() };
         let id = self.links.add(Instant::now(), link.clone(), url, control);
         let direct = self.direct.link_up(Instant::now(), id, link.peer().node_id, remote);
         let what = match direct {
@@ -52,7 +52,7 @@ impl<N: RosNetwork> Core<N> {
         let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
         let is_abandoned = reply.send(Some(place)).is_err();
         self.router.handle_link_up(now(), id, neighbour);
-        self.router.handle_link_quality(now(), id, rtt, false);
+        self.router.handle_link_quality(now(), id, quality);
         if direct.is_some() && !self.direct.may_meet(link.peer()) {
             self.close_not_permitted(id);
         }
@@ -88,8 +88,9 @@ impl<N: RosNetwork> Core<N> {
     /// Looks at the links, and passes the measurements to the router.
     pub(super) fn look_at_links(&mut self, at: Instant) {
         let now = now();
-        for LinkMeasurement { link, rtt, is_silent } in self.links.look(at) {
-            self.router.handle_link_quality(now, link, rtt, is_silent);
+        for (link, quality) in self.links.look(at) {
+            self.router.handle_link_quality(now, link, quality);
+            self.direct.link_looked_at(at, link, quality.is_silent);
             self.tell_address(link);
         }
         self.look_at_direct(at);

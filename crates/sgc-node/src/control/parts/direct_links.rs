@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
-use sgc_router::{DirectReach, LinkId};
+use sgc_router::{DirectReach, LinkId, Router};
 use sgc_session::{DirectOutput, DirectPaths, LocalAddress, NoDirectPath};
 use sgc_transport::{CheckDatagram, DirectHandle};
 use sgc_trust::{Grantees, VerifiedPeer};
@@ -22,6 +22,8 @@ use crate::link::roaming::source_towards;
 const REFLEXIVE_MAX: usize = 3;
 /// Time after which a direct link is closed over which neither node wants data.
 const UNUSED_MAX: Duration = Duration::from_secs(120);
+/// Time after which one is closed that has a better one beside it.
+const SUPERSEDED_MAX: Duration = Duration::from_secs(10);
 
 /// The sockets of direct links, and the task that dials.
 pub(crate) struct DirectEnds {
@@ -33,7 +35,9 @@ pub(crate) struct DirectEnds {
 #[derive(Debug)]
 struct DirectLink {
     peer: NodeId,
-    /// Time since which neither node wants data of the other.
+    /// Whether nothing arrives over it.
+    is_silent: bool,
+    /// Time since which neither node wants data of the other, or a better link has the data.
     unused: Option<Instant>,
 }
 
@@ -87,10 +91,11 @@ impl DirectLinks {
         self.addresses_changed(now);
     }
 
-    /// Sets the addresses from which routers see this node come.
+    /// Sets the addresses from which routers see this node come. Without routers, those known last stay: a NAT keeps the
+    /// mapping as long as the socket is used.
     pub(crate) fn set_reflexive(&mut self, now: Instant, reflexive: impl Iterator<Item = SocketAddr>) {
-        let reflexive = reflexive.collect();
-        if self.reflexive != reflexive {
+        let reflexive: BTreeSet<_> = reflexive.collect();
+        if self.reflexive != reflexive && !reflexive.is_empty() {
             self.reflexive = reflexive;
             self.addresses_changed(now);
         }
@@ -149,7 +154,7 @@ impl DirectLinks {
         if !is_direct {
             return None;
         }
-        self.links.insert(link, DirectLink { peer, unused: None });
+        self.links.insert(link, DirectLink { peer, is_silent: false, unused: None });
         self.paths.linked(now, peer);
         let is_near = self.host.iter().any(|host| host.is_near(remote.ip()));
         Some(if is_near { DirectReach::Near } else { DirectReach::Far })
@@ -160,7 +165,23 @@ impl DirectLinks {
         let Some(DirectLink { peer, .. }) = self.links.remove(&link) else { return };
         if self.links.values().all(|other| other.peer != peer) {
             self.paths.ended(now, peer);
+        } else {
+            self.silence_changed(now, peer);
         }
+    }
+
+    /// Notes whether nothing arrives over a link.
+    pub(crate) fn link_looked_at(&mut self, now: Instant, link: LinkId, is_silent: bool) {
+        let Some(direct) = self.links.get_mut(&link) else { return };
+        if std::mem::replace(&mut direct.is_silent, is_silent) != is_silent {
+            let peer = direct.peer;
+            self.silence_changed(now, peer);
+        }
+    }
+
+    fn silence_changed(&mut self, now: Instant, peer: NodeId) {
+        let is_silent = self.links.values().filter(|link| link.peer == peer).all(|link| link.is_silent);
+        self.paths.silent(now, peer, is_silent);
     }
 
     /// Returns `true` for a direct link.
@@ -169,13 +190,15 @@ impl DirectLinks {
     }
 
     /// Returns the direct links that nothing has used for a while.
-    pub(crate) fn unused(&mut self, now: Instant, is_used: impl Fn(LinkId) -> bool) -> Vec<LinkId> {
+    pub(crate) fn unused(&mut self, now: Instant, router: &Router) -> Vec<LinkId> {
         let mut over = Vec::new();
         for (link, direct) in &mut self.links {
+            let is_superseded = router.is_superseded(*link);
             // Data that goes over a router to spare the uplink may come back.
-            let is_used = is_used(*link) || self.paths.is_wanted(&direct.peer);
+            let is_used = !is_superseded && (self.paths.is_wanted(&direct.peer) || router.is_used(*link));
+            let unused_max = if is_superseded { SUPERSEDED_MAX } else { UNUSED_MAX };
             direct.unused = if is_used { None } else { direct.unused.or(Some(now)) };
-            if direct.unused.is_some_and(|since| now.saturating_duration_since(since) >= UNUSED_MAX) {
+            if direct.unused.is_some_and(|since| now.saturating_duration_since(since) >= unused_max) {
                 over.push(*link);
             }
         }
@@ -207,9 +230,9 @@ impl DirectLinks {
     pub(crate) fn poll(&mut self) -> Option<DirectOutput> {
         let ends = self.ends.as_ref()?;
         loop {
-            let output = self.paths.poll();
+            let output = self.paths.poll()?;
             ends.handle.take_checks(self.paths.has_attempts());
-            match output? {
+            match output {
                 // Another source than the system's has another mapping than the link would have.
                 DirectOutput::Send { from, to, datagram } => {
                     if source_towards(to) == Some(from.ip()) {

@@ -10,7 +10,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_router::LinkId;
+use sgc_router::{LinkId, LinkQuality};
 use sgc_session::{KeepAlive, KeepAlivePolicy, LinkObservation, is_of_host};
 use sgc_transport::{AnyLink, CloseReason, Link, LinkStats};
 use sgc_trust::VerifiedPeer;
@@ -55,13 +55,6 @@ pub(crate) struct LinkTable {
     drops: Arc<dyn CountDrops>,
     /// Bytes that were sent and received over links that have ended.
     ended_bytes: (u64, u64),
-}
-
-/// Measurement of a link.
-pub(crate) struct LinkMeasurement {
-    pub(crate) link: LinkId,
-    pub(crate) rtt: Duration,
-    pub(crate) is_silent: bool,
 }
 
 /// A link that was removed.
@@ -154,7 +147,7 @@ impl LinkTable {
     }
 
     /// Looks at all links, if that is due: probes peers, and closes links whose peer does not answer.
-    pub(crate) fn look(&mut self, now: Instant) -> Vec<LinkMeasurement> {
+    pub(crate) fn look(&mut self, now: Instant) -> Vec<(LinkId, LinkQuality)> {
         if self.look_due.is_none_or(|due| due > now) {
             return Vec::new();
         }
@@ -163,7 +156,8 @@ impl LinkTable {
             let stats = entry.link.stats();
             entry.control.lanes().look(now, &stats);
             let is_silent = entry.look(now, stats.received_bytes, stats.rtt, &self.names);
-            LinkMeasurement { link: *id, rtt: stats.rtt, is_silent }
+            let LinkStats { rtt, sent_packets, lost_packets, .. } = stats;
+            (*id, LinkQuality { round_trip: rtt, is_silent, sent_packets, lost_packets })
         });
         looks.collect()
     }
@@ -454,7 +448,7 @@ mod tests {
         let (second, _frames) = bench.add(at(300)).await;
         assert_eq!(bench.table.deadline(), Some(at(500)), "the second link does not move the look");
         assert!(bench.table.look(at(499)).is_empty());
-        let measured: Vec<_> = bench.table.look(at(500)).iter().map(|seen| seen.link).collect();
+        let measured: Vec<_> = bench.table.look(at(500)).iter().map(|(link, _)| *link).collect();
         assert_eq!((measured, bench.table.deadline()), (vec![first, second], Some(at(1000))));
         bench.table.remove(first);
         bench.table.remove(second);
@@ -470,8 +464,8 @@ mod tests {
         let mut looks = (1..).map(|n| begin + n * LOOK_EVERY);
         let closed = looks.by_ref().take(100).find(|now| {
             let seen = bench.table.look(*now);
-            assert!(seen.len() == 1 && seen[0].link == link);
-            bench.table.links[&link].closed_for.is_some() && seen[0].is_silent
+            assert!(seen.len() == 1 && seen[0].0 == link);
+            bench.table.links[&link].closed_for.is_some() && seen[0].1.is_silent
         });
         assert!(closed.is_some(), "a silent peer is given up");
         assert!(matches!(frames.recv().await, Some(Outgoing::Frame(Control::Probe { answers: false }))));
