@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use sgc_testkit::FakeDomain;
 
 use crate::flow::{Flow, LATE};
-use crate::lab::{Lab, Nat, RANGES};
+use crate::lab::{Carrier, Lab, Nat, RANGES};
 use crate::node::Node;
 use crate::support::{eventually, say};
 use crate::{CALM, Pair, cable, can_run, is_long, turn};
@@ -15,6 +15,8 @@ use crate::{CALM, Pair, cable, can_run, is_long, turn};
 const TRIES_LONG: u32 = 200;
 /// Time between two of them: a node takes four attempts of a peer in ten seconds.
 const TRY_EVERY: Duration = Duration::from_millis(2700);
+/// Most pairs of networks that are tried at one time.
+const CELLS_AT_ONCE: usize = 6;
 /// Time in which a first attempt succeeds, from the start of the node on.
 const FIRST_ATTEMPT: Duration = Duration::from_secs(2);
 
@@ -47,19 +49,112 @@ fn judge(pair: &Pair) -> Vec<String> {
     wrong
 }
 
-/// Restarts the desk again and again. Its first attempt has to succeed nearly always.
-fn try_often(lab: &Lab, pair: &mut Pair, what: &str) {
+/// A pair of networks, and whether theory allows a direct path between them.
+struct Cell {
+    name: String,
+    lab: Lab,
+    /// The URL by which the robot dials the router.
+    router: String,
+    is_feasible: bool,
+}
+
+impl Cell {
+    fn new(name: String, lab: Lab, is_feasible: bool) -> Self {
+        let router = lab.url("quic");
+        Self { name, lab, router, is_feasible }
+    }
+
+    /// A robot and a desk behind one NAT each.
+    fn behind((near, near_nat): (&str, Nat), (far, far_nat): (&str, Nat)) -> Self {
+        let lab = Lab::new(cable(), near_nat);
+        lab.set_far_nat(far_nat);
+        // A symmetric NAT has another port for each address, and these admit the known one alone.
+        let strict = ["firewall", "port restricted", "symmetric"];
+        let is_hopeless = |one: &str, other: &str| one == "symmetric" && strict.contains(&other);
+        Self::new(format!("{near} to {far}"), lab, !is_hopeless(near, far) && !is_hopeless(far, near))
+    }
+
+    /// The robot behind the NATs of a home and of a carrier.
+    fn behind_carrier(far: (&str, Nat)) -> Self {
+        let mut lab = Lab::new(cable(), Nat::PortRestricted);
+        lab.add_carrier(Carrier::PortRestricted);
+        lab.set_far_nat(far.1);
+        Self::new(format!("carrier over home to {}", far.0), lab, true)
+    }
+
+    /// The robot and the desk behind NATs of homes, and those behind one NAT of a carrier.
+    fn at_one_carrier(does_hairpin: bool) -> Self {
+        let mut lab = Lab::new(cable(), Nat::PortRestricted);
+        lab.add_carrier(if does_hairpin { Carrier::Hairpin } else { Carrier::NoHairpin });
+        lab.join_desk_to_carrier();
+        let name = if does_hairpin { "one carrier, hairpin" } else { "one carrier, no hairpin" };
+        Self::new(name.to_owned(), lab, does_hairpin)
+    }
+
+    /// Both behind symmetric NATs, with IPv6 beside it or, at the robot, in its place. `None` where there is no IPv6.
+    fn with_ipv6(has_v4: bool) -> Option<Self> {
+        let mut lab = Lab::new(cable(), Nat::RandomPort(RANGES[0]));
+        if !lab.add_ipv6() {
+            say("NO IPV6: direct links over it are not tested");
+            return None;
+        }
+        if has_v4 {
+            return Some(Self::new("symmetric, and IPv6".to_owned(), lab, true));
+        }
+        lab.robot.ip(&["address", "flush", "dev", "eth0", "scope", "global"]).unwrap();
+        lab.robot.ip(&["-6", "address", "add", "2001:db8:1::2/64", "dev", "eth0", "nodad"]).unwrap();
+        lab.robot.ip(&["-6", "route", "replace", "default", "via", "2001:db8:1::1"]).unwrap();
+        lab.desk.ip(&["-6", "address", "flush", "dev", "eth0"]).unwrap();
+        let router = lab.url_v6();
+        Some(Self { router, ..Self::new("IPv6 to IPv4".to_owned(), lab, false) })
+    }
+
+    /// Lets a robot and a desk in these networks exchange data. In the long run, restarts the desk again and again: its
+    /// first attempt has to succeed nearly always.
+    fn run(&self) {
+        let Self { name, lab, router, is_feasible } = self;
+        let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+        let mut pair = Pair::start(lab, "quic", &[router]);
+        pair.wait_for("never begins", |_| 1);
+        let begun = Instant::now();
+        if *is_feasible {
+            eventually(&format!("a direct link, {name}"), || direct_links(&pair.robot) > 0);
+            let after = begun.elapsed();
+            eventually("also at the other end", || direct_links(&pair.desk) > 0);
+            say(&format!("  {name:<36} {:>9}", after.as_millis()));
+        } else {
+            let given_up = |why: String| !why.contains("is being looked for");
+            eventually("it is given up", || why_not(&pair.desk).is_some_and(given_up));
+            let why = why_not(&pair.desk).unwrap();
+            let theory =
+                if name.starts_with("IPv6") { "the two nodes have no address" } else { "no packet passes" };
+            assert!(why.starts_with(theory), "{name}: {why}");
+            assert_eq!(direct_links(&pair.robot), 0, "{name}");
+            say(&format!("  {name:<36}   relayed"));
+        }
+        pair.wait_for("does not go on", |flow| flow.said() + 1);
+        sleep(CALM);
+        let wrong = judge(&pair);
+        assert!(wrong.is_empty(), "{name}: {wrong:?}");
+        if *is_feasible && is_long() {
+            try_often(lab, &mut pair, name);
+        }
+    }
+}
+
+/// Restarts the desk again and again.
+fn try_often(lab: &Lab, pair: &mut Pair, name: &str) {
     let tries = std::env::var("SGC_DIRECT_TRIES").map_or(TRIES_LONG, |tries| tries.parse().unwrap());
     let mut soon = 0;
     for _ in 0..tries {
         sleep(TRY_EVERY);
         pair.restart_desk(lab);
         let begun = Instant::now();
-        eventually(&format!("a direct link, {what}"), || direct_links(&pair.desk) > 0);
+        eventually(&format!("a direct link, {name}"), || direct_links(&pair.desk) > 0);
         soon += u32::from(begun.elapsed() < FIRST_ATTEMPT);
     }
-    say(&format!("  {what}: {soon} of {tries} at the first attempt"));
-    assert!(soon * 100 >= 95 * tries, "{what}: {soon} of {tries}");
+    say(&format!("  {name}: {soon} of {tries} at the first attempt"));
+    assert!(soon * 100 >= 95 * tries, "{name}: {soon} of {tries}");
 }
 
 /// All pairs of networks in the long run, and some in the short one. `sgc-session` has all of them on a virtual clock.
@@ -73,44 +168,22 @@ fn nodes_behind_nats_get_a_direct_link_as_theory_says() {
         ("public", Nat::Public),
         ("firewall", Nat::Firewall),
         ("full cone", Nat::FullCone),
+        ("address restricted", Nat::AddressRestricted),
         ("port restricted", Nat::PortRestricted),
         ("symmetric", Nat::RandomPort(RANGES[0])),
     ];
-    let short = [(0, 4), (1, 2), (3, 3), (2, 4), (3, 4)];
+    let short = [(0, 5), (1, 3), (4, 4), (2, 5), (4, 5)];
     let all = (0..nats.len()).flat_map(|near| (near..nats.len()).map(move |far| (near, far)));
     let pairs: Vec<_> = if is_long() { all.collect() } else { short.to_vec() };
-    say("\nDirect links\n  robot            desk             after, ms");
-    for (near, far) in pairs {
-        meet(nats[near], nats[far]);
-    }
-}
-
-/// Lets a robot and a desk in these networks exchange data.
-fn meet((near, near_nat): (&str, Nat), (far, far_nat): (&str, Nat)) {
-    let lab = Lab::new(cable(), near_nat);
-    lab.set_far_nat(far_nat);
-    let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
-    let mut pair = Pair::start(&lab, "quic", &[&lab.url("quic")]);
-    pair.wait_for("never begins", |_| 1);
-    let begun = Instant::now();
-    let is_feasible = far != "symmetric" || !["firewall", "port restricted", "symmetric"].contains(&near);
-    if is_feasible {
-        eventually(&format!("a direct link, {near} to {far}"), || direct_links(&pair.robot) > 0);
-        let after = begun.elapsed();
-        eventually("also at the other end", || direct_links(&pair.desk) > 0);
-        say(&format!("  {near:<16} {far:<16} {:>9}", after.as_millis()));
-    } else {
-        let blocked = |why: String| why.starts_with("no packet passes");
-        eventually("it is given up", || why_not(&pair.desk).is_some_and(blocked));
-        assert_eq!(direct_links(&pair.robot), 0, "{near} to {far}");
-        say(&format!("  {near:<16} {far:<16}   relayed"));
-    }
-    pair.wait_for("does not go on", |flow| flow.said() + 1);
-    sleep(CALM);
-    let wrong = judge(&pair);
-    assert!(wrong.is_empty(), "{near} to {far}: {wrong:?}");
-    if is_feasible && is_long() {
-        try_often(&lab, &mut pair, &format!("{near} to {far}"));
+    let mut cells: Vec<_> = pairs.iter().map(|(near, far)| Cell::behind(nats[*near], nats[*far])).collect();
+    cells.extend(
+        nats[2..5].iter().rev().take(if is_long() { 3 } else { 1 }).map(|far| Cell::behind_carrier(*far)),
+    );
+    cells.extend([true, false].map(Cell::at_one_carrier));
+    cells.extend([true, false].into_iter().filter_map(Cell::with_ipv6));
+    say("\nDirect links\n  robot to desk                        after, ms");
+    for cells in cells.chunks(CELLS_AT_ONCE) {
+        std::thread::scope(|scope| cells.iter().for_each(|cell| drop(scope.spawn(|| cell.run()))));
     }
 }
 
@@ -292,6 +365,125 @@ fn robot_whose_udp_is_blocked_stays_with_its_router_and_says_why() {
     let blocked = |why: String| why.starts_with("no packet passes");
     eventually("it is given up", || why_not(&pair.desk).is_some_and(blocked));
     assert_eq!((direct_links(&pair.robot), direct_links(&pair.desk)), (0, 0));
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+/// Waits until the data goes over a direct link again, after an event, and says how long that took and what it cost.
+fn direct_again(pair: &Pair, what: &str, begun: Instant) {
+    pair.wait_for("does not go on", |flow| flow.said() + 1);
+    eventually("a direct link again", || {
+        direct_links(&pair.robot) > 0 && direct_links(&pair.desk) > 0 && carries(&pair.robot)
+    });
+    let after = begun.elapsed().as_millis();
+    sleep(CALM);
+    let outage = pair.flows.iter().map(|flow| flow.judge(begun).outage).max().unwrap().as_millis();
+    say(&format!("  {what}: {outage} ms without data, direct again after {after} ms"));
+}
+
+/// Returns `true` if the data goes over the direct link.
+fn carries(node: &Node) -> bool {
+    let now = || (carried(node, true), carried(node, false));
+    let before = now();
+    let since = || {
+        let now = now();
+        (now.0.saturating_sub(before.0), now.1.saturating_sub(before.1))
+    };
+    eventually("data", || {
+        let (directly, relayed) = since();
+        directly + relayed > 6_000
+    });
+    let (directly, relayed) = since();
+    directly > relayed
+}
+
+#[test]
+fn direct_link_follows_a_robot_and_a_desk_that_move() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::PortRestricted);
+    lab.add_lte();
+    let (_cloud, pair) = direct_pair(&lab);
+    say("\nRoaming with a direct link");
+    for _ in 0..if is_long() { 5 } else { 1 } {
+        let moves = [("10.3.0.1", "10.2.0.3/24", "10.2.0.2/24"), ("10.1.0.1", "10.2.0.2/24", "10.2.0.3/24")];
+        for (gateway, comes, goes) in moves {
+            let begun = Instant::now();
+            lab.route_by(gateway);
+            direct_again(&pair, "the robot moves to another uplink", begun);
+            let begun = Instant::now();
+            lab.change_desk(comes, goes);
+            direct_again(&pair, "the desk gets another address", begun);
+        }
+        for (gateway, comes, goes) in moves {
+            let begun = Instant::now();
+            lab.route_by(gateway);
+            lab.change_desk(comes, goes);
+            direct_again(&pair, "both at once", begun);
+        }
+    }
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+#[test]
+fn data_goes_directly_while_the_router_restarts() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::PortRestricted);
+    let (mut cloud, pair) = direct_pair(&lab);
+    let begun = Instant::now();
+    for _ in 0..if is_long() { 5 } else { 1 } {
+        drop(cloud);
+        pair.wait_for("does not go on without the router", |flow| flow.said() + 1);
+        cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+        for node in [&pair.robot, &pair.desk] {
+            eventually("both have the router again", || {
+                node.status()["links"].as_array().unwrap().len() == 2
+            });
+        }
+        pair.wait_for("does not go on", |flow| flow.said() + 1);
+        sleep(CALM);
+    }
+    let outage = pair.flows.iter().map(|flow| flow.judge(begun).outage).max().unwrap().as_millis();
+    say(&format!("\nThe router restarts while the data goes directly: {outage} ms without data at most"));
+    assert!(carries(&pair.robot));
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+#[test]
+fn data_goes_over_the_router_while_the_direct_path_loses_a_fifth() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::PortRestricted);
+    let (_cloud, pair) = direct_pair(&lab);
+    let begun = Instant::now();
+    lab.lose_between_sites(20);
+    eventually("the data goes over the router", || !carries(&pair.robot));
+    let left = begun.elapsed().as_millis();
+    // It does not come back as long as packets are lost.
+    for _ in 0..if is_long() { 60 } else { 3 } {
+        sleep(CALM);
+        assert!(!carries(&pair.robot));
+    }
+    assert!(direct_links(&pair.robot) > 0 && direct_links(&pair.desk) > 0);
+    lab.join_sites();
+    let begun = Instant::now();
+    if is_long() {
+        eventually("the data goes directly again", || carries(&pair.robot));
+    }
+    let back = begun.elapsed().as_millis();
+    say(&format!(
+        "\n20 % loss on the direct path: over the router after {left} ms, direct again {back} ms after it"
+    ));
+    pair.wait_for("does not go on", |flow| flow.said() + 1);
     let wrong = judge(&pair);
     assert!(wrong.is_empty(), "{wrong:?}");
 }

@@ -1,5 +1,5 @@
 //! A robot and a desk behind a NAT each, and a router with a public address between them; every one a network
-//! namespace. All of it goes with the lab.
+//! namespace. A carrier with a NAT of its own may stand before the NATs. All of it goes with the lab.
 //!
 //! ```text
 //! robot ─ eth0 ──── lan ─ near ─ wan ──── cloud ──── wan ─ far ─ lan ──── eth0 ─ desk
@@ -27,6 +27,7 @@ use crate::support::say;
 const SCHEMES: [&str; 7] = ["quic", "dtls", "udp", "tls", "tcp", "ws", "wss"];
 const PORT: u16 = 7447;
 const ROUTER: &str = "10.10.0.1";
+const ROUTER_V6: &str = "2001:db8:10::1";
 
 static LABS: AtomicU32 = AtomicU32::new(0);
 
@@ -46,6 +47,8 @@ pub(crate) fn schemes() -> Vec<&'static str> {
 pub(crate) enum Nat {
     /// Keeps ports and admits any sender to them.
     FullCone,
+    /// Keeps ports and admits the addresses of contacted senders.
+    AddressRestricted,
     /// Draws each port at random from this range and admits only contacted senders.
     RandomPort(&'static str),
     /// Keeps ports and admits only contacted senders.
@@ -54,6 +57,17 @@ pub(crate) enum Nat {
     Firewall,
     /// No NAT and no firewall.
     Public,
+}
+
+/// The NAT of a carrier.
+#[derive(Clone, Copy)]
+pub(crate) enum Carrier {
+    /// Keeps ports and admits only contacted senders.
+    PortRestricted,
+    /// Keeps ports and admits any sender to them from outside.
+    NoHairpin,
+    /// Keeps ports and admits any sender to them, also from inside.
+    Hairpin,
 }
 
 /// Ranges for a NAT that forgets.
@@ -66,9 +80,12 @@ pub(crate) enum Lan {
 }
 
 pub(crate) struct Lab {
+    number: u32,
     dir: TempDir,
     fleet: Fleet,
     path: Option<TunLink>,
+    has_ipv6: bool,
+    carrier: Option<Arc<Namespace>>,
     pub(crate) robot: Arc<Namespace>,
     pub(crate) near: Arc<Namespace>,
     pub(crate) cloud: Arc<Namespace>,
@@ -79,14 +96,14 @@ pub(crate) struct Lab {
 impl Lab {
     pub(crate) fn new(lan: Lan, nat: Nat) -> Self {
         let number = LABS.fetch_add(1, Ordering::SeqCst);
-        let make = |place: &str| {
-            let name = format!("sgctr-{}-{number}-{place}", std::process::id());
-            Arc::new(Namespace::create(name).unwrap())
-        };
+        let make = |place: &str| place_of(number, place);
         let mut lab = Self {
+            number,
             dir: tempfile::tempdir().unwrap(),
             fleet: Fleet::create("lab".parse().unwrap(), unix_now(), &mut OsRng.unwrap_err()).unwrap(),
             path: None,
+            has_ipv6: false,
+            carrier: None,
             robot: make("robot"),
             near: make("near"),
             cloud: make("cloud"),
@@ -102,7 +119,6 @@ impl Lab {
         lab.desk.ip(&["route", "add", "default", "via", "10.2.0.1"]).unwrap();
         lab.near.ip(&["route", "add", "default", "via", "10.10.1.1"]).unwrap();
         lab.far.ip(&["route", "add", "default", "via", "10.10.2.1"]).unwrap();
-        let forward = || fs::write("/proc/sys/net/ipv4/ip_forward", "1").unwrap();
         lab.cloud.within(forward).unwrap();
         for site in [&lab.near, &lab.far] {
             site.within(|| {
@@ -139,6 +155,84 @@ impl Lab {
         Some(TunLink::start(ends, &options).unwrap())
     }
 
+    /// Puts a carrier with a NAT between the robot's NAT and the internet.
+    pub(crate) fn add_carrier(&mut self, carrier: Carrier) {
+        let place = place_of(self.number, "carrier");
+        self.near.ip(&["link", "del", "wan"]).unwrap();
+        place.veth(("wan", &["10.10.1.2/24"]), &self.cloud, ("near", &["10.10.1.1/24"])).unwrap();
+        place.ip(&["route", "add", "default", "via", "10.10.1.1"]).unwrap();
+        place.within(forward).unwrap();
+        self.near.veth(("wan", &["100.64.0.2/24"]), &place, ("lan0", &["100.64.0.1/24"])).unwrap();
+        self.near.ip(&["route", "add", "default", "via", "100.64.0.1"]).unwrap();
+        // Ports are mapped back as they were mapped, for any sender.
+        let back = |from| {
+            format!(
+                "table ip carrier {{\n\
+                 map back {{ type inet_service : ipv4_addr . inet_service; flags dynamic; size 65535; }}\n\
+                 chain out {{ type nat hook postrouting priority 100; \
+                 oifname \"wan\" ip protocol udp update @back {{ udp sport : ip saddr . udp sport }}; \
+                 oifname \"wan\" masquerade; \
+                 iifname \"lan*\" oifname \"lan*\" snat to 10.10.1.2; }}\n\
+                 chain in {{ type nat hook prerouting priority -100; \
+                 {from} ip daddr 10.10.1.2 ip protocol udp dnat ip to udp dport map @back; }}\n}}\n"
+            )
+        };
+        let rules = match carrier {
+            Carrier::PortRestricted => {
+                "table ip carrier {\nchain out { type nat hook postrouting priority 100; oifname \"wan\" masquerade; }\n\
+                 chain own { type filter hook input priority 0; iifname \"wan\" ct state new drop; }\n}\n"
+                    .to_owned()
+            }
+            Carrier::NoHairpin => back("iifname \"wan\""),
+            Carrier::Hairpin => back(""),
+        };
+        self.load_rules(&place, "nat", &rules);
+        self.carrier = Some(place);
+    }
+
+    /// Moves the desk's NAT behind the same carrier.
+    pub(crate) fn join_desk_to_carrier(&self) {
+        let carrier = self.carrier.as_ref().unwrap();
+        self.far.ip(&["link", "del", "wan"]).unwrap();
+        self.far.veth(("wan", &["100.64.1.2/24"]), carrier, ("lan1", &["100.64.1.1/24"])).unwrap();
+        self.far.ip(&["route", "add", "default", "via", "100.64.1.1"]).unwrap();
+        // The two networks of customers do not reach each other by their own addresses.
+        let rules = "table ip apart {\nchain through { type filter hook forward priority 0; \
+                     iifname \"lan*\" oifname \"lan*\" ct status dnat accept; iifname \"lan*\" oifname \"lan*\" drop; }\n}\n";
+        self.load_rules(carrier, "apart", rules);
+    }
+
+    /// Gives all places IPv6 as well, with firewalls at both sites that admit contacted senders. Returns `false` if this
+    /// machine has no IPv6.
+    pub(crate) fn add_ipv6(&mut self) -> bool {
+        self.has_ipv6 = std::path::Path::new("/proc/sys/net/ipv6").exists();
+        if !self.has_ipv6 {
+            return false;
+        }
+        let six = |place: &Namespace, args: &str| {
+            place.ip(&[&["-6"], &args.split(' ').collect::<Vec<_>>()[..]].concat()).unwrap();
+        };
+        six(&self.cloud, &format!("address add {ROUTER_V6}/128 dev lo nodad"));
+        let sites = [(&self.robot, &self.near, "near", 1), (&self.desk, &self.far, "far", 2)];
+        for (host, nat, name, n) in sites {
+            six(host, &format!("address add 2001:db8:{n}::2/64 dev eth0 nodad"));
+            six(nat, &format!("address add 2001:db8:{n}::1/64 dev lan nodad"));
+            six(nat, &format!("address add 2001:db8:a{n}::2/64 dev wan nodad"));
+            six(&self.cloud, &format!("address add 2001:db8:a{n}::1/64 dev {name} nodad"));
+            six(host, &format!("route add default via 2001:db8:{n}::1"));
+            six(nat, &format!("route add default via 2001:db8:a{n}::1"));
+            six(&self.cloud, &format!("route add 2001:db8:{n}::/64 via 2001:db8:a{n}::2"));
+            let rules = "table ip6 firewall {\nchain through { type filter hook forward priority 0; \
+                         iifname \"wan\" meta l4proto udp ct state new drop; }\n}\n";
+            self.load_rules(nat, "firewall", rules);
+        }
+        for place in [&self.near, &self.far, &self.cloud] {
+            let forward = || fs::write("/proc/sys/net/ipv6/conf/all/forwarding", "1").unwrap();
+            place.within(forward).unwrap();
+        }
+        true
+    }
+
     /// Adds a second uplink of the robot, like mobile radio. It is up but not the default route.
     pub(crate) fn add_lte(&self) {
         self.robot.veth(("lte", &["10.3.0.2/24"]), &self.near, ("lte", &["10.3.0.1/24"])).unwrap();
@@ -147,6 +241,14 @@ impl Lab {
     /// Moves the robot's default route.
     pub(crate) fn route_by(&self, gateway: &str) {
         self.robot.ip(&["route", "replace", "default", "via", gateway]).unwrap();
+    }
+
+    /// Gives the desk another address in place of the one that it has.
+    pub(crate) fn change_desk(&self, comes: &str, goes: &str) {
+        self.desk.ip(&["address", "del", goes, "dev", "eth0"]).unwrap();
+        self.desk.ip(&["address", "add", comes, "dev", "eth0"]).unwrap();
+        // The route went with the address.
+        self.desk.ip(&["route", "replace", "default", "via", "10.2.0.1"]).unwrap();
     }
 
     /// Replaces the NAT of the desk's network.
@@ -164,7 +266,7 @@ impl Lab {
             Nat::Firewall | Nat::Public => {
                 self.cloud.ip(&["route", "replace", network, "via", gateway]).unwrap();
             }
-            Nat::FullCone | Nat::RandomPort(_) | Nat::PortRestricted => {
+            Nat::FullCone | Nat::AddressRestricted | Nat::RandomPort(_) | Nat::PortRestricted => {
                 let _ = self.cloud.ip(&["route", "del", network]);
             }
         }
@@ -172,6 +274,14 @@ impl Lab {
             Nat::FullCone => format!(
                 "chain out {{ type nat hook postrouting priority 100; oifname \"wan\" masquerade; }}\n\
                  chain in {{ type nat hook prerouting priority -100; iifname \"wan\" ip protocol {{ tcp, udp }} dnat to {inside}; }}"
+            ),
+            Nat::AddressRestricted => format!(
+                "set contacted {{ type ipv4_addr; flags dynamic; size 1024; }}\n\
+                 chain out {{ type nat hook postrouting priority 100; \
+                 oifname \"wan\" update @contacted {{ ip daddr }}; oifname \"wan\" masquerade; }}\n\
+                 chain in {{ type nat hook prerouting priority -100; \
+                 iifname \"wan\" ip saddr @contacted ip protocol {{ tcp, udp }} dnat to {inside}; }}\n\
+                 chain own {{ type filter hook input priority 0; iifname \"wan\" ct state new drop; }}"
             ),
             Nat::RandomPort(range) => format!(
                 "chain out {{ type nat hook postrouting priority 100; \
@@ -213,6 +323,14 @@ impl Lab {
         self.load_rules(&self.cloud, "cut", &format!("flush ruleset\ntable ip cut {{\n{rules}\n}}\n"));
     }
 
+    /// Loses so many packets of a hundred that go from one site to the other.
+    pub(crate) fn lose_between_sites(&self, percent: u32) {
+        let rules = format!(
+            "chain through {{ type filter hook forward priority 0; numgen random mod 100 < {percent} drop; }}"
+        );
+        self.load_rules(&self.cloud, "cut", &format!("flush ruleset\ntable ip cut {{\n{rules}\n}}\n"));
+    }
+
     /// Lets it pass again.
     pub(crate) fn join_sites(&self) {
         self.load_rules(&self.cloud, "cut", "flush ruleset\n");
@@ -237,10 +355,18 @@ impl Lab {
         format!("{scheme}://{ROUTER}:{}", port(scheme))
     }
 
+    /// Returns the router's URL over IPv6; see [`Lab::add_ipv6`].
+    pub(crate) fn url_v6(&self) -> String {
+        format!("quic://[{ROUTER_V6}]:{PORT}")
+    }
+
     /// The router's configuration: it listens for every transport of this build.
     pub(crate) fn router_config(&self) -> PathBuf {
-        let listen: Vec<_> =
+        let mut listen: Vec<_> =
             schemes().iter().map(|scheme| format!("\"{scheme}://0.0.0.0:{}\"", port(scheme))).collect();
+        if self.has_ipv6 {
+            listen.push(format!("\"{}\"", self.url_v6()));
+        }
         self.write_config("cloud", &[], &format!("[router]\nlisten = [{}]\n", listen.join(", ")))
     }
 
@@ -268,6 +394,15 @@ impl Lab {
         file.write_all(identity.to_text().as_bytes()).unwrap();
         Arc::new(identity)
     }
+}
+
+/// Creates the namespace of a place in a lab.
+fn place_of(number: u32, place: &str) -> Arc<Namespace> {
+    Arc::new(Namespace::create(format!("sgctr-{}-{number}-{place}", std::process::id())).unwrap())
+}
+
+fn forward() {
+    fs::write("/proc/sys/net/ipv4/ip_forward", "1").unwrap();
 }
 
 fn port(scheme: &str) -> u16 {
