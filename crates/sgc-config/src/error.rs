@@ -402,17 +402,6 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
-    /// A direct link with another fleet.
-    #[error(
-        "`{key}` names {value:?}: direct links lead to nodes (\"desk\"), groups (\"group:operators\") or all nodes \
-         (\"*\") of the own fleet"
-    )]
-    DirectPeer {
-        /// The key.
-        key: &'static str,
-        /// The value.
-        value: String,
-    },
     /// A value that is no node id.
     #[error("`{key}` names {value:?}; a node id is 64 hexadecimal digits: `sgc status` there shows it")]
     NodeId {

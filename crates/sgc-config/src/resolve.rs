@@ -154,7 +154,8 @@ pub(crate) fn resolve(
     let trust = resolver.ca_files(&draft.trust, TRUST_MAX);
     let operators = draft.operators.as_ref().map(|operators| resolver.operators(operators));
     let observers = draft.observers.as_ref().map(|observers| resolver.observers(observers));
-    let direct = draft.direct.as_ref().map(|direct| resolver.direct(direct));
+    let direct = draft.direct.as_ref();
+    let direct = direct.map(|peers| resolver.recipients(peers, node_name.as_ref(), &draft.partners));
     let authority = draft.authority.as_ref().and_then(|fleet| resolver.fleet(fleet));
     let authority =
         authority.map(|fleet| AuthorityConfig { fleet, operators: operators.unwrap_or_default() });
@@ -422,14 +423,6 @@ impl Resolver<'_> {
     fn observers(&mut self, written: &WithOrigin<Vec<WithOrigin<String>>>) -> Vec<Recipient> {
         self.members(written, |recipient| match recipient {
             Recipient::Partner(_) => Err(|key, value| Mistake::Observer { key, value }),
-            Recipient::Everyone | Recipient::Node(_) | Recipient::Group(_) => Ok(()),
-        })
-    }
-
-    /// Peers with direct links are of the own fleet.
-    fn direct(&mut self, written: &WithOrigin<Vec<WithOrigin<String>>>) -> Vec<Recipient> {
-        self.members(written, |recipient| match recipient {
-            Recipient::Partner(_) => Err(|key, value| Mistake::DirectPeer { key, value }),
             Recipient::Everyone | Recipient::Node(_) | Recipient::Group(_) => Ok(()),
         })
     }

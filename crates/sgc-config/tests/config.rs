@@ -721,6 +721,11 @@ fn direct_links_are_for_all_for_none_or_for_the_named() {
     assert_eq!(words(direct("'auto'")), ["*"]);
     assert!(direct("'never'").is_empty() && direct("[]").is_empty());
     assert_eq!(words(direct("['group:operators', 'desk']")), ["group:operators", "desk"]);
+    let acme = "[[partner]]\nname = 'acme'\nca = 'acme.pem'\n";
+    assert_eq!(
+        words(good(&format!("{NODE}node.direct = ['*', 'partner:acme']\n{acme}")).direct),
+        ["*", "partner:acme"]
+    );
     for wrong in ["'always'", "true", "['partner:acme']", "['desk', 'desk']", "['']"] {
         let said = said_about(&format!("node.direct = {wrong}"));
         assert!(said.len() == 1 && said[0].contains("direct"), "{said:?}");

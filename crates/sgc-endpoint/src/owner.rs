@@ -105,7 +105,7 @@ impl Owner {
             types: TypeAnswers::new(&own),
             consumers: ConsumerReports::new(&own),
             reports: MemberRequests::new(None, REPORTS_ASKED_MAX),
-            paths: MemberRequests::new(None, PATHS_ASKED_MAX),
+            paths: MemberRequests::new(None, PATHS_ASKED_MAX).with_partners(),
             enforce_at: None,
         };
         owner.advertise_all();

@@ -1,5 +1,5 @@
-//! [`MemberRequests`]: requests of this fleet's nodes that the driver answers later: for credentials, for an operation,
-//! or for a report. Each node has one place.
+//! [`MemberRequests`]: requests of nodes that the driver answers later: for credentials, for an operation, for a report,
+//! or for addresses. Each node has one place.
 
 use std::collections::BTreeMap;
 
@@ -24,6 +24,8 @@ pub(crate) struct MemberRequests {
     asked: BTreeMap<SinkId, GrantedSink>,
     /// Most nodes that have a place.
     max: usize,
+    /// Whether nodes of other fleets may ask, too.
+    takes_partners: bool,
 }
 
 /// A new request.
@@ -35,7 +37,12 @@ pub(crate) struct MemberRequest {
 
 impl MemberRequests {
     pub(crate) fn new(name: Option<BlindName>, max: usize) -> Self {
-        Self { name, asked: BTreeMap::new(), max }
+        Self { name, asked: BTreeMap::new(), max, takes_partners: false }
+    }
+
+    /// Takes requests of trusted nodes of other fleets as well. The driver decides about each.
+    pub(crate) fn with_partners(self) -> Self {
+        Self { takes_partners: true, ..self }
     }
 
     /// Takes requests at this name. Returns the blind to advertise, unless it is advertised already.
@@ -81,7 +88,7 @@ impl MemberRequests {
         };
         let peer = asked.peer.clone();
         let is_of_another = self.asked.get(&sink).is_some_and(|known| known.peer.node_id != peer.node_id);
-        if !cx.is_own_fleet(&peer) || is_of_another {
+        if !(self.takes_partners || cx.is_own_fleet(&peer)) || is_of_another {
             cx.refuse(name, sink, 1, RefuseReason::NotPermitted);
             return None;
         }

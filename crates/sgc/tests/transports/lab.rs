@@ -14,6 +14,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Once};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_testkit::netsim::{Namespace, TunEnd, TunLink, TunOptions};
 use sgc_transport::LinkUrl;
@@ -385,9 +387,25 @@ impl Lab {
 
     /// An identity of the fleet, also as a file.
     pub(crate) fn enroll(&self, node: &str, router: bool) -> Arc<Identity> {
+        self.enroll_in(&self.fleet, node, router)
+    }
+
+    /// An identity of another fleet as a file, and the certificates of both fleets' CAs: `lab-ca.pem` and
+    /// `FLEET-ca.pem`.
+    pub(crate) fn enroll_partner(&self, fleet: &str, node: &str) {
+        let other = Fleet::create(fleet.parse().unwrap(), unix_now(), &mut OsRng.unwrap_err()).unwrap();
+        self.enroll_in(&other, node, false);
+        for (name, fleet) in [("lab", &self.fleet), (fleet, &other)] {
+            let base64 = STANDARD.encode(fleet.ca_certificate());
+            let pem = format!("-----BEGIN CERTIFICATE-----\n{base64}\n-----END CERTIFICATE-----\n");
+            fs::write(self.path(&format!("{name}-ca.pem")), pem).unwrap();
+        }
+    }
+
+    fn enroll_in(&self, fleet: &Fleet, node: &str, router: bool) -> Arc<Identity> {
         let mut request = EnrollRequest::new(node.parse().unwrap(), unix_now());
         request.router = router;
-        let identity = self.fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap();
+        let identity = fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap();
         let mut options = fs::OpenOptions::new();
         let file = options.write(true).create(true).truncate(true).mode(0o600);
         let mut file = file.open(self.path(&format!("{node}.identity"))).unwrap();

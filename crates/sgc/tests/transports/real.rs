@@ -175,3 +175,64 @@ fn node_that_was_killed_has_its_direct_link_again_at_once() {
         assert_eq!((made("robot"), made("desk")), (n + 2, n + 2), "after the restart of {node}");
     }
 }
+
+/// A topic of another company by token. Both companies name each other for direct links, and then one does no more.
+#[test]
+fn partners_have_a_direct_link_if_both_name_each_other() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(Lan::Cable, Nat::PortRestricted);
+    lab.enroll("cloud", true);
+    lab.enroll("robot", false);
+    lab.enroll_partner("acme", "desk");
+    let url = lab.url("quic");
+    let ros = "[ros]\ndomain_id = 0\ndiscovery_range = \"localhost\"\nstatic_peers = []\n";
+    let partner = |name: &str| {
+        format!(
+            "direct = [\"partner:{name}\"]\n{ros}[[partner]]\nname = \"{name}\"\nca = \"{name}-ca.pem\"\n"
+        )
+    };
+    lab.write_config(
+        "cloud",
+        &[],
+        &format!("trust = [\"acme-ca.pem\"]\n[router]\nlisten = [\"quic://0.0.0.0:7447\"]\n"),
+    );
+    lab.write_config(
+        "robot",
+        &[&url],
+        &format!("{}[[share]]\ntopic = \"/chatter\"\nto = [\"partner:acme\"]\n", partner("acme")),
+    );
+    lab.write_config("desk", &[&url], &partner("lab"));
+    let _cloud = run(&lab, &lab.cloud, "cloud");
+    let _robot = run(&lab, &lab.robot, "robot");
+    let _desk = run(&lab, &lab.desk, "desk");
+    let command = |namespace: &Namespace, args: &[&str]| {
+        let output = support::sgc(Some(namespace), lab.dir()).args(args).output().unwrap();
+        assert!(output.status.success(), "{args:?}: {output:?}");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let type_name = ["--type", "std_msgs/msg/String"];
+    let create =
+        ["token", "share", "create", "-c", "robot.toml", "--topic", "/chatter", "--to", "acme-ca.pem"];
+    let token = command(&lab.robot, &[&create[..], &type_name, &["--valid", "1d", "--via", &url]].concat());
+    std::fs::write(lab.path("chatter.token"), token).unwrap();
+    command(&lab.desk, &["token", "use", "chatter.token", "-c", "desk.toml"]);
+    let _talker = peer(&lab, &lab.robot, "pub", "cyclone", &["--rate", "50", "--verbose"]);
+    let mut listener = peer(&lab, &lab.desk, "sub", "fastdds", &["--verbose"]);
+    listener.wait("a message", |event| event["event"] == "received");
+    let direct = |node: &str, namespace: &Namespace| {
+        let status = command(namespace, &["status", "--json", "-c", &format!("{node}.toml")]);
+        let status: Value = serde_json::from_str(&status).unwrap();
+        status["links"].as_array().unwrap().iter().filter(|link| link["direct"] == true).count()
+    };
+    eventually("a direct link", || direct("robot", &lab.robot) > 0 && direct("desk", &lab.desk) > 0);
+    let file = lab.path("desk.toml");
+    let config = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(&file, config.replace("direct = [\"partner:lab\"]\n", "")).unwrap();
+    command(&lab.desk, &["reload", "-c", "desk.toml"]);
+    eventually("it ends", || direct("robot", &lab.robot) == 0 && direct("desk", &lab.desk) == 0);
+    listener.events.try_iter().for_each(drop);
+    listener.wait("a message over the router", |event| event["event"] == "received");
+}
