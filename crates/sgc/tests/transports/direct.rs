@@ -429,6 +429,36 @@ fn direct_link_follows_a_robot_and_a_desk_that_move() {
 }
 
 #[test]
+fn direct_link_moves_to_a_cable_and_back() {
+    if !can_run() {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::PortRestricted);
+    let (_cloud, pair) = direct_pair(&lab);
+    let over_cable = |node: &Node| {
+        let links = node.status()["links"].as_array().cloned().unwrap();
+        let remotes = links.iter().filter_map(|link| link["remote"].as_str());
+        remotes.filter(|remote| remote.starts_with("10.9.0.")).count()
+    };
+    say("\nA cable between robot and desk");
+    for _ in 0..if is_long() { 5 } else { 1 } {
+        let begun = Instant::now();
+        lab.set_cable(true);
+        eventually("a link over the cable", || over_cable(&pair.robot) == 1 && over_cable(&pair.desk) == 1);
+        direct_again(&pair, "laid", begun);
+        eventually("the other direct link ends", || direct_links(&pair.robot) == 1);
+        assert_eq!(over_cable(&pair.robot), 1);
+        let begun = Instant::now();
+        lab.set_cable(false);
+        direct_again(&pair, "pulled", begun);
+        eventually("the link over the cable ends", || over_cable(&pair.robot) == 0);
+    }
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+#[test]
 fn data_goes_directly_while_the_router_restarts() {
     if !can_run() {
         return;

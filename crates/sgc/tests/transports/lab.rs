@@ -245,6 +245,15 @@ impl Lab {
         self.robot.ip(&["route", "replace", "default", "via", gateway]).unwrap();
     }
 
+    /// Lays a cable from the robot to the desk, or pulls it.
+    pub(crate) fn set_cable(&self, is_laid: bool) {
+        if is_laid {
+            self.robot.veth(("cable", &["10.9.0.1/24"]), &self.desk, ("cable", &["10.9.0.2/24"])).unwrap();
+        } else {
+            self.robot.ip(&["link", "del", "cable"]).unwrap();
+        }
+    }
+
     /// Gives the desk another address in place of the one that it has.
     pub(crate) fn change_desk(&self, comes: &str, goes: &str) {
         self.desk.ip(&["address", "del", goes, "dev", "eth0"]).unwrap();
