@@ -1,5 +1,5 @@
 //! Decisions about the links of a node, and about the traffic that it starts by itself: keep-alive, back-off, bulk lanes,
-//! claims, candidates, questions for types, shaping. [`LinkSupervisor`] decides when a link is replaced.
+//! claims, candidates, port mappings, questions for types, shaping. [`LinkSupervisor`] decides when a link is replaced.
 //!
 //! Pure machines: time and randomness are arguments, and nothing here opens a socket, spawns a task or waits.
 //! `sgc-node` observes, passes events in, and carries the results out.
@@ -13,6 +13,7 @@ mod direct;
 mod failback;
 mod keep_alive;
 mod origin;
+mod port_mapping;
 mod shaper;
 mod supervisor;
 mod type_questions;
@@ -31,6 +32,10 @@ pub use direct::{
 pub use failback::Failback;
 pub use keep_alive::{ASK_MAX, Activity, KeepAlive, KeepAlivePolicy, LinkObservation, PeerState, Verdict};
 pub use origin::{Move, Origin};
+pub use port_mapping::{
+    GrantedMapping, MAPPING_LIFETIME, MapperOutput, MappingFailure, MappingProtocol, MappingTarget,
+    PortMapper,
+};
 pub use shaper::Shaper;
 pub use supervisor::{
     DOUBT_AFTER, DialCause, Event, LinkFacts, LinkKey, LinkSupervisor, NETWORK_NEWS_MAX, Output,
