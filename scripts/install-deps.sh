@@ -67,6 +67,8 @@ if [ "$what" = test ]; then
     need 'command -v certutil' libnss3-tools -- "a browser that has imported a gateway's certificate"
     need 'command -v ip' iproute2 -- "isolated networks for the tests (ip netns)"
     need 'command -v nft' nftables -- "NATs and firewalls between them"
+    # The package leaves its service off unless debconf is told otherwise.
+    need 'test -x /usr/sbin/miniupnpd' miniupnpd miniupnpd-nftables -- "a gateway that maps ports (PCP, NAT-PMP, UPnP-IGD)"
     need 'compgen -G "/usr/lib/*/faketime/libfaketimeMT.so.1"' libfaketime -- "nodes with wrong clocks"
     need 'command -v openssl' openssl -- "an independent DTLS program, a keystore for DDS Security"
 fi

@@ -110,6 +110,7 @@ pub(crate) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         resolver: None,
         keep_alive: None,
         direct: None,
+        port_mapping: None,
         listen: all("--listen", &args.listen),
         peer_rate: None,
         mapping: None,

@@ -79,6 +79,8 @@ pub struct Config {
     pub metrics: Option<MetricsConfig>,
     /// Nodes and groups of the fleet with which this node has direct links.
     pub direct: Vec<Recipient>,
+    /// Whether this node asks its gateway to map a port for direct links.
+    pub port_mapping: bool,
     /// Path of the status socket, if not the usual one.
     pub admin_socket: Option<PathBuf>,
     /// Nodes and groups of the fleet that may ask this node how it is doing; [`Config::observers`] has the usual ones

@@ -53,6 +53,7 @@ pub(crate) struct Draft {
     pub(crate) keep_alive: Option<WithOrigin<String>>,
     /// The peers, or one of the words `auto` and `never` in place of a list.
     pub(crate) direct: Option<WithOrigin<Vec<WithOrigin<String>>>>,
+    pub(crate) port_mapping: Option<WithOrigin<bool>>,
     pub(crate) listen: Vec<WithOrigin<String>>,
     pub(crate) peer_rate: Option<WithOrigin<String>>,
     pub(crate) mapping: Option<WithOrigin<String>>,

@@ -102,6 +102,7 @@ impl FileReader<'_> {
             routers: self.routers(node.as_ref()),
             keep_alive: self.string(node.as_ref(), "keep_alive", "\"auto\", or a string such as \"5s\""),
             direct: self.direct(node.as_ref()),
+            port_mapping: self.boolean(node.as_ref(), "port_mapping", "true or false"),
             resolver: self.string(node.as_ref(), "resolver", "a string, such as \"10.0.0.53\""),
             listen: self.flat_strings(
                 router.as_ref(),

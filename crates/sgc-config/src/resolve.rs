@@ -193,6 +193,7 @@ pub(crate) fn resolve(
             gateway,
             metrics,
             direct: direct.unwrap_or_else(|| vec![Recipient::Everyone]),
+            port_mapping: draft.port_mapping.as_ref().is_none_or(|written| written.value),
             admin_socket,
             observers,
         }),

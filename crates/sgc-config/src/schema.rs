@@ -104,6 +104,7 @@ impl Table {
                 "resolver",
                 "keep_alive",
                 "direct",
+                "port_mapping",
                 "identity",
                 "state",
                 "trust",

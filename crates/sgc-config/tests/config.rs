@@ -733,6 +733,14 @@ fn direct_links_are_for_all_for_none_or_for_the_named() {
 }
 
 #[test]
+fn ports_are_mapped_unless_the_file_says_otherwise() {
+    let maps = |text: &str| good(&format!("{NODE}{text}")).port_mapping;
+    assert!(maps("") && maps("node.port_mapping = true") && !maps("node.port_mapping = false"));
+    let said = said_about("node.port_mapping = 'upnp'");
+    assert!(said.len() == 1 && said[0].contains("port_mapping"), "{said:?}");
+}
+
+#[test]
 fn keep_alive_is_a_time_or_left_to_the_node() {
     let kept = |text: &str| good(&format!("{NODE}node.keep_alive = '{text}'")).keep_alive;
     assert_eq!(good(NODE).keep_alive, None);

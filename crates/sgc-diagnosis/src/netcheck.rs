@@ -1,5 +1,5 @@
 //! The network of a node as its routers see it: whether UDP passes, whether a NAT stands in between and how it maps
-//! ports (RFC 4787), and IPv6.
+//! ports (RFC 4787), whether the gateway maps a port for the node, and IPv6.
 //!
 //! A router tells each node that dials it from which address the node comes. All QUIC links of a node leave from one
 //! socket for each address family, so two routers that see different ports reveal how the NAT maps. How it filters is
@@ -11,7 +11,7 @@ use serde::Serialize;
 use sgc_process::output;
 use sgc_process::style::{self, Line, Tone, Toned};
 
-use crate::status::{Link, Router, Status};
+use crate::status::{Link, PortMapping, Router, Status};
 
 /// Schemes of the transports over UDP.
 const UDP_SCHEMES: [&str; 3] = ["quic", "dtls", "udp"];
@@ -27,6 +27,7 @@ pub struct Netcheck {
     udp: Udp,
     nat: Nat,
     mapping: Mapping,
+    port_mapping: PortMapping,
     ipv6: Ipv6,
 }
 
@@ -125,7 +126,8 @@ impl Netcheck {
         let is_v6 = |link: &RouterView| link.remote.is_some_and(|remote| remote.is_ipv6());
         let ipv6 = Ipv6 { linked: links.iter().any(is_v6), address: status.ipv6 };
         let (node, not_linked) = (status.node.clone(), not_linked.collect());
-        Self { node, not_linked, udp, nat, mapping, ipv6, links }
+        let port_mapping = status.port_mapping.clone();
+        Self { node, not_linked, udp, nat, mapping, port_mapping, ipv6, links }
     }
 
     /// Returns the lines of `sgc netcheck`.
@@ -141,7 +143,14 @@ impl Netcheck {
             );
         }
         lines.push(Line::default());
-        let said = [Some(self.udp_line()), self.nat_line(), self.mapping_line(), Some(self.ipv6_line())];
+        let port_mapping = port_mapping_line(&self.port_mapping);
+        let said = [
+            Some(self.udp_line()),
+            self.nat_line(),
+            self.mapping_line(),
+            port_mapping,
+            Some(self.ipv6_line()),
+        ];
         lines.extend(said.into_iter().flatten().map(|part| Line::new([part])));
         lines
     }
@@ -270,6 +279,46 @@ impl NotLinked {
     }
 }
 
+/// Says whether the gateway maps a port; `None` for a node of an older version.
+fn port_mapping_line(mapping: &PortMapping) -> Option<Toned> {
+    let gateway = mapping.gateway.map_or_else(|| "?".to_owned(), |gateway| gateway.to_string());
+    Some(match mapping.state.as_str() {
+        "off" => {
+            let why = mapping.why_off.as_deref().unwrap_or("the node does not say why");
+            format!("Port mapping: off, because {why}.").into()
+        }
+        "looking" => format!("Port mapping: the gateway {gateway} is being asked.").into(),
+        "mapped" => {
+            let external = mapping.external.map_or_else(|| "?".to_owned(), |external| external.to_string());
+            let protocol = protocol_name(mapping.protocol.as_deref().unwrap_or("?"));
+            let said = format!("Port mapping: the gateway {gateway} maps {external} by {protocol}");
+            if mapping.behind_nat {
+                let why = "a private address, so another NAT stands behind the gateway";
+                Toned::new(Tone::Attention, format!("{said}: {why}."))
+            } else {
+                Toned::new(Tone::Good, format!("{said}."))
+            }
+        }
+        "failed" => {
+            let failures = mapping.failures.iter();
+            let why: Vec<_> = failures
+                .map(|(protocol, why)| format!("{}: {}", protocol_name(protocol), why.replace('_', " ")))
+                .collect();
+            format!("Port mapping: the gateway {gateway} offers none ({}).", why.join("; ")).into()
+        }
+        _ => return None,
+    })
+}
+
+/// Returns the name of a protocol as its specification writes it.
+fn protocol_name(key: &str) -> String {
+    match key {
+        "nat_pmp" => "NAT-PMP".to_owned(),
+        "upnp_igd" => "UPnP-IGD".to_owned(),
+        other => other.to_uppercase(),
+    }
+}
+
 /// Returns the transport of a URL.
 fn scheme(url: &str) -> &str {
     url.split_once("://").map_or(url, |(scheme, _)| scheme)
@@ -342,6 +391,45 @@ mod tests {
         assert_eq!(netcheck(&[]).udp, Udp::Unknown);
         assert_eq!(netcheck(std::slice::from_ref(&tls)).udp, Udp::SeemsBlocked);
         assert_eq!(netcheck(&[tls, link("quic://r2.example", "192.0.2.2:7447", None)]).udp, Udp::Passes);
+    }
+
+    #[test]
+    fn gateway_is_said_to_map_a_port_or_why_it_does_not() {
+        let said = |mapping: Value| {
+            let document = json!({ "node": "robot", "port_mapping": mapping });
+            let netcheck = Netcheck::of(&serde_json::from_value(document).unwrap());
+            let lines = netcheck.lines().into_iter().map(|line| line.to_string());
+            lines.into_iter().find(|line| line.starts_with("Port mapping"))
+        };
+        let mapped = |protocol: &str, behind_nat: bool| {
+            said(json!({
+                "state": "mapped", "gateway": "192.168.1.1", "protocol": protocol,
+                "external": "203.0.113.7:5000", "behind_nat": behind_nat, "lifetime_s": 7000,
+            }))
+        };
+        assert_eq!(
+            mapped("pcp", false).unwrap(),
+            "Port mapping: the gateway 192.168.1.1 maps 203.0.113.7:5000 by PCP."
+        );
+        assert_eq!(
+            mapped("upnp_igd", true).unwrap(),
+            "Port mapping: the gateway 192.168.1.1 maps 203.0.113.7:5000 by UPnP-IGD: a private address, so another NAT \
+             stands behind the gateway."
+        );
+        let failures = json!({ "pcp": "unsupported", "nat_pmp": "no_answer" });
+        assert_eq!(
+            said(json!({ "state": "failed", "gateway": "192.168.1.1", "failures": failures })).unwrap(),
+            "Port mapping: the gateway 192.168.1.1 offers none (NAT-PMP: no answer; PCP: unsupported)."
+        );
+        assert_eq!(
+            said(json!({ "state": "looking", "gateway": "192.168.1.1" })).unwrap(),
+            "Port mapping: the gateway 192.168.1.1 is being asked."
+        );
+        assert_eq!(
+            said(json!({ "state": "off", "why_off": "no router over QUIC sees a NAT" })).unwrap(),
+            "Port mapping: off, because no router over QUIC sees a NAT."
+        );
+        assert_eq!(said(json!({})), None);
     }
 
     #[test]

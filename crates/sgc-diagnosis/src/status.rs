@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use sgc_node::admin::AdminRequest;
 use sgc_node::alerts::Alert;
 use sgc_process::output;
@@ -29,6 +29,7 @@ pub struct Status {
     /// Routers that the node dials or searches.
     pub routers: Vec<Router>,
     not_direct: Vec<NotDirect>,
+    pub(crate) port_mapping: PortMapping,
     /// Address of the host from which packets to the IPv6 internet leave.
     pub(crate) ipv6: Option<IpAddr>,
     /// Shares and uses.
@@ -54,6 +55,22 @@ pub struct Status {
 struct NotDirect {
     name: String,
     why: String,
+}
+
+/// The port that a node's gateway maps for direct links. The state of an older node is empty.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(default)]
+pub(crate) struct PortMapping {
+    pub(crate) state: String,
+    pub(crate) why_off: Option<String>,
+    pub(crate) gateway: Option<IpAddr>,
+    pub(crate) protocol: Option<String>,
+    pub(crate) external: Option<SocketAddr>,
+    /// The external address is a private one.
+    pub(crate) behind_nat: bool,
+    pub(crate) lifetime_s: Option<u64>,
+    /// Reasons by protocol.
+    pub(crate) failures: BTreeMap<String, String>,
 }
 
 /// Pushes of metrics of a node. Its alerts have the present fault.

@@ -8,7 +8,7 @@ use crate::error::CliError;
 use crate::node::NodeArgs;
 use crate::output;
 
-/// Show the network of a running node as its routers see it: UDP, NAT, IPv6
+/// Show the network of a running node as its routers see it: UDP, NAT, port mapping, IPv6
 ///
 /// A router tells each node from which address its packets come. So the command needs no server of its own, and sends
 /// nothing. How a NAT maps ports shows once links over UDP to two routers with different addresses are up.

@@ -1,7 +1,9 @@
 //! How a node is doing, as its status socket tells it: one JSON document a connection.
 
 use std::collections::BTreeMap;
+use std::net::Ipv4Addr;
 use std::sync::atomic::Ordering::Relaxed;
+use std::time::Instant;
 
 use serde::Serialize;
 use sgc_gateway::GatewayStatus;
@@ -12,6 +14,7 @@ use super::route_words::route_state;
 use crate::control::faults::alerts::Alert;
 use crate::data::stats::NameStats;
 use crate::discovery::board::RouterStatus;
+use crate::link::mapping_report::MappingReport;
 use crate::metrics::push::PushStatus;
 
 /// The status document.
@@ -29,6 +32,8 @@ pub struct Status {
     pub routers: Vec<RouterStatus>,
     /// The peers with which data is exchanged over routers, although they may have a direct link.
     pub not_direct: Vec<NotDirect>,
+    /// The port that the gateway maps for direct links.
+    pub port_mapping: PortMappingStatus,
     /// The address of this host from which packets to the IPv6 internet leave; null without a route there.
     pub ipv6: Option<String>,
     /// Shares and uses, and the state of each.
@@ -65,6 +70,56 @@ pub struct NotDirect {
     pub name: String,
     /// Why there is no direct link, in words.
     pub why: String,
+}
+
+/// The port that the gateway maps for direct links.
+#[derive(Clone, Debug, Serialize)]
+pub struct PortMappingStatus {
+    /// `"off"`, `"looking"`, `"mapped"` or `"failed"`.
+    pub state: &'static str,
+    /// Why the gateway is not asked, in words; null unless the state is `"off"`.
+    pub why_off: Option<String>,
+    /// The gateway that is asked.
+    pub gateway: Option<String>,
+    /// The protocol of the mapping: `"pcp"`, `"nat_pmp"` or `"upnp_igd"`; null unless the state is `"mapped"`.
+    pub protocol: Option<&'static str>,
+    /// The address and port to which peers send; null unless the state is `"mapped"`.
+    pub external: Option<String>,
+    /// `true` if that address is a private one, so another NAT stands behind the gateway.
+    pub behind_nat: bool,
+    /// Seconds until the mapping ends, unless it is renewed.
+    pub lifetime_s: Option<u64>,
+    /// The reasons for which the last attempt failed, by protocol: `"no_answer"`, `"unsupported"`, `"not_permitted"`,
+    /// `"no_room"`, `"permanent_only"`, `"no_external_address"`, `"unstable"`, `"malformed"` or `"not_sent"`.
+    pub failures: BTreeMap<&'static str, &'static str>,
+}
+
+impl PortMappingStatus {
+    pub(crate) fn new(report: &MappingReport, now: Instant) -> Self {
+        let mapping = report.mapping.map(|(mapping, _)| mapping);
+        let state = match (&report.off, &mapping) {
+            (Some(_), _) => "off",
+            (None, Some(_)) => "mapped",
+            (None, None) if report.is_looking => "looking",
+            (None, None) => "failed",
+        };
+        Self {
+            state,
+            why_off: report.off.map(|why| why.to_string()),
+            gateway: report.gateway.map(|gateway| gateway.to_string()),
+            protocol: mapping.map(|mapping| mapping.protocol.key()),
+            external: mapping.map(|mapping| mapping.external.to_string()),
+            behind_nat: mapping.is_some_and(|mapping| is_private(*mapping.external.ip())),
+            lifetime_s: report.mapping.map(|(_, end)| end.saturating_duration_since(now).as_secs()),
+            failures: report.failures.iter().map(|(protocol, why)| (protocol.key(), why.key())).collect(),
+        }
+    }
+}
+
+/// Returns `true` for an address that only networks behind a NAT use (RFC 1918, RFC 6598).
+fn is_private(ip: Ipv4Addr) -> bool {
+    let [first, second, ..] = ip.octets();
+    ip.is_private() || (first == 100 && second & 0xc0 == 64)
 }
 
 /// A link that is up.

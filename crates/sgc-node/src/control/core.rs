@@ -209,6 +209,8 @@ pub(crate) struct CoreParts<N> {
     pub(crate) direct: Option<DirectEnds>,
     /// The peers that may have direct links.
     pub(crate) direct_peers: Grantees,
+    /// Whether the gateway is asked to map a port for these.
+    pub(crate) port_mapping: bool,
     /// Source of the passwords of checks.
     pub(crate) rng: ChaCha20Rng,
 }
@@ -280,7 +282,7 @@ impl<N: RosNetwork> Core<N> {
             local_taps: Vec::new(),
         };
         core.set_observers(parts.observers);
-        core.set_direct(parts.direct_peers);
+        core.set_direct(parts.direct_peers, parts.port_mapping);
         (core, requested)
     }
 
@@ -341,6 +343,7 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Frame { link, frame, room } => self.handle_frame(link, frame, room),
             CoreEvent::Check(check) => self.check_arrived(&check),
             CoreEvent::HostAddresses(addresses) => self.host_addresses(addresses),
+            CoreEvent::PortMapping(report) => self.port_mapped(report),
             CoreEvent::NotDialled(peer) => self.direct.not_dialled(Instant::now(), peer),
             CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
             CoreEvent::Malformed { link } => {
@@ -375,6 +378,7 @@ impl<N: RosNetwork> Core<N> {
                 member_names,
                 observers,
                 direct,
+                port_mapping,
                 operators,
                 rights,
                 peer_rate,
@@ -386,7 +390,7 @@ impl<N: RosNetwork> Core<N> {
                 }
                 self.add_message_keys(message_keys);
                 self.set_observers(observers);
-                self.set_direct(direct);
+                self.set_direct(direct, port_mapping);
                 if let Some(authority) = &mut self.authority {
                     authority.set_operators(operators);
                 }

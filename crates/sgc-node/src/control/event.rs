@@ -30,6 +30,7 @@ use crate::data::tap::{Tap, TapError, TapRequest};
 use crate::data::writer_queue::WriterQueue;
 use crate::link::control_tx::ControlTx;
 use crate::link::direct_address::HostAddress;
+use crate::link::mapping_report::MappingReport;
 use crate::metrics::readings::Readings;
 
 /// Events that may wait for the control task. Senders wait while it is full.
@@ -75,6 +76,8 @@ pub(crate) enum CoreEvent {
     Check(CheckDatagram),
     /// The addresses of this host changed, or are known for the first time.
     HostAddresses(Vec<HostAddress>),
+    /// The state of the port mapping changed.
+    PortMapping(MappingReport),
     /// No direct link to this peer was made.
     NotDialled(NodeId),
     /// A link has taken all control frames before a flush.
@@ -153,6 +156,8 @@ pub(crate) enum CoreEvent {
         observers: Grantees,
         /// The peers that may have direct links.
         direct: Grantees,
+        /// Whether the gateway is asked to map a port for these.
+        port_mapping: bool,
         /// The peers that may change the fleet of which this node is the authority.
         operators: Grantees,
         /// The rate that each peer may send, bits a second; `None` for no limit.

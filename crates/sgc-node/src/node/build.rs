@@ -37,6 +37,7 @@ use crate::gateway::access::{access_with, refused_tokens};
 use crate::gateway::certificate::gateway_expiry_warning;
 use crate::gateway::{Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, Sockets, listen_at};
 use crate::link::direct_address::{DIRECT_DIALS_MAX, DirectDial};
+use crate::link::mapping_report::{MappingOff, MappingWish};
 use crate::local::network_slot::NetworkSlot;
 use crate::metrics::Metrics;
 use crate::node::error::NodeError;
@@ -91,6 +92,8 @@ pub(super) struct CoreChannels {
     pub(super) inbox: mpsc::Receiver<CoreEvent>,
     /// Peers to dial without a router.
     pub(super) direct_dials: mpsc::Receiver<DirectDial>,
+    /// Whether a port is to be mapped.
+    pub(super) mapping_wishes: watch::Receiver<MappingWish>,
     /// Requests of the control task's sinks.
     pub(super) requested: mpsc::Receiver<SinkRequest>,
     /// Notified when links have to be made again.
@@ -116,7 +119,9 @@ pub(super) async fn build<N: RosNetwork>(
     let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());
     let sockets = LinkSockets::bind(&config, &identity, &rules, &anchors)?;
     let (dials, direct_dials) = mpsc::channel(DIRECT_DIALS_MAX);
-    let direct = sockets.direct.as_ref().map(|direct| DirectEnds { handle: direct.handle.clone(), dials });
+    let (mapping, mapping_wishes) = watch::channel(MappingWish::Off(MappingOff::NoDirectLinks));
+    let direct = sockets.direct.as_ref();
+    let direct = direct.map(|direct| DirectEnds { handle: direct.handle.clone(), dials, mapping });
     let mut rng = system_rng()?;
     let machines = Machines::new(&config, &identity, &rules, anchors, network.is_some(), &mut rng);
     let again = open.as_ref().zip(config.ros.as_ref()).map(|(open, ros)| open_again(open, ros));
@@ -144,6 +149,7 @@ pub(super) async fn build<N: RosNetwork>(
         observers: rules.observers.clone(),
         direct,
         direct_peers: rules.direct.clone(),
+        port_mapping: rules.port_mapping,
         rng: ChaCha20Rng::from_rng(&mut rng),
         rights: rules.rights.clone(),
         board: board.clone(),
@@ -173,7 +179,8 @@ pub(super) async fn build<N: RosNetwork>(
         names: names.clone(),
         storage,
     });
-    let channels = CoreChannels { events, inbox, direct_dials, requested, on_redial, all_ended };
+    let channels =
+        CoreChannels { events, inbox, direct_dials, mapping_wishes, requested, on_redial, all_ended };
     Ok(BuiltNode {
         config,
         identity,

@@ -7,9 +7,10 @@ use sgc_transport::{CloseReason, Link};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
-use tracing::warn;
+use tracing::{info, warn};
 
 use crate::control::event::CoreEvent;
+use crate::link::port_mapping::REMOVAL_MAX;
 use crate::node::spawn::RunningNode;
 use crate::state::audit::{AuditEvent, AuditRecord};
 
@@ -39,6 +40,12 @@ impl<N: RosNetwork> RunningNode<N> {
         // If both are the same dialer, the second call does nothing.
         tokio::join!(self.dialer.close(CloseReason::Goodbye), self.lane_dialer.close(CloseReason::Goodbye));
         let _ = self.core.await;
+        if let Some(mapping) = &mut self.mapping
+            && timeout(REMOVAL_MAX, &mut *mapping).await.is_err()
+        {
+            mapping.abort();
+            info!("the gateway did not answer in time; the port mapping ends by itself");
+        }
         drop(self.reloader);
         if timeout(DRAIN_MAX, self.all_ended.recv()).await.is_err() {
             warn!("the local network did not take everything in time");

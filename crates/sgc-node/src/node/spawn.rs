@@ -4,6 +4,8 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng as _;
 use sgc_config::Config;
 use sgc_ros::RosNetwork;
 use sgc_transport::{Dialer, DirectSockets, ListenAddr, Listener};
@@ -22,6 +24,7 @@ use crate::gateway::Gateway;
 use crate::link::direct;
 use crate::link::lanes::LaneAdmission;
 use crate::link::links::{Admission, keep_accepting};
+use crate::link::port_mapping;
 use crate::link::roaming::Network;
 use crate::local::dds_discovery::discover;
 use crate::local::network_slot::NetworkSlot;
@@ -41,6 +44,8 @@ pub(super) struct RunningNode<N: RosNetwork> {
     pub(super) events: mpsc::Sender<CoreEvent>,
     /// Tasks that end with the node.
     pub(super) tasks: Vec<JoinHandle<()>>,
+    /// The task of the port mapping, which removes it after the control task ended.
+    pub(super) mapping: Option<JoinHandle<()>>,
     /// Tasks that accept links, each with the sender that stops it.
     pub(super) accepting: Vec<(JoinHandle<()>, oneshot::Sender<()>)>,
     /// The task of the status socket.
@@ -64,7 +69,8 @@ pub(super) async fn spawn<N: RosNetwork>(
     file_watch: Option<FileWatch>,
 ) -> Result<RunningNode<N>, NodeError> {
     let BuiltNode { config, identity, rules, audit, network, gateway, channels, sockets, board, .. } = node;
-    let (events, rng) = (channels.events, node.rng);
+    let (events, mut rng) = (channels.events, node.rng);
+    let mapping_rng = ChaCha20Rng::from_rng(&mut rng);
     let core = tokio::spawn(node.core.run(channels.inbox, channels.requested));
     if let Some(network) = network.get() {
         let events = events.clone();
@@ -103,9 +109,13 @@ pub(super) async fn spawn<N: RosNetwork>(
     let accepting = sockets.listeners.into_iter().map(|listener| accept(listener, admission())).collect();
     let mut accepting: Vec<_> = accepting;
     let mut tasks = Vec::new();
+    let mut mapping = None;
     if let Some(DirectSockets { listeners, checks, .. }) = sockets.direct {
         accepting.extend(listeners.into_iter().map(|listener| begin_accepting(listener, admission())));
         tasks.push(tokio::spawn(direct::serve(keeper.clone(), checks, channels.direct_dials)));
+        let (network, core) = (keeper.network.onward(), events.clone());
+        let keep_mapped = port_mapping::serve(channels.mapping_wishes, network, core, mapping_rng);
+        mapping = Some(tokio::spawn(keep_mapped));
     }
     let node_name = identity.node_name().to_string();
     let socket = admin_socket_path(&config, &node_name);
@@ -161,6 +171,7 @@ pub(super) async fn spawn<N: RosNetwork>(
         core,
         events,
         tasks,
+        mapping,
         accepting,
         socket,
         reloader,

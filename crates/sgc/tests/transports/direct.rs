@@ -20,19 +20,19 @@ const CELLS_AT_ONCE: usize = 6;
 /// Time in which a first attempt succeeds, from the start of the node on.
 const FIRST_ATTEMPT: Duration = Duration::from_secs(2);
 
-fn direct_links(node: &Node) -> usize {
+pub(crate) fn direct_links(node: &Node) -> usize {
     let status = node.status();
     let links = status["links"].as_array().cloned().unwrap();
     links.iter().filter(|link| link["direct"] == true).count()
 }
 
 /// Returns why a node has no direct link to its only peer.
-fn why_not(node: &Node) -> Option<String> {
+pub(crate) fn why_not(node: &Node) -> Option<String> {
     Some(node.status()["not_direct"][0]["why"].as_str()?.to_owned())
 }
 
 /// Ends the flows. Returns what was wrong with them.
-fn judge(pair: &Pair) -> Vec<String> {
+pub(crate) fn judge(pair: &Pair) -> Vec<String> {
     pair.flows.iter().for_each(|flow| flow.end());
     let mut wrong = Vec::new();
     for flow in &pair.flows {

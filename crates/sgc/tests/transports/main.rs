@@ -12,7 +12,9 @@
 
 mod direct;
 mod flow;
+mod igd;
 mod lab;
+mod mapping;
 mod node;
 mod real;
 #[path = "../support/mod.rs"]

@@ -7,7 +7,8 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 
 use serde_json::Value;
-use sgc_node::{RunOptions, config, run_on};
+use sgc_node::admin::AdminRequest;
+use sgc_node::{ConfigSource, RunOptions, config, run_on};
 use sgc_testkit::FakeDomain;
 use sgc_testkit::FakeRos;
 use sgc_testkit::netsim::Namespace;
@@ -42,10 +43,12 @@ impl Node {
         let (stop, stopped) = oneshot::channel::<()>();
         let (ready, is_ready) = oneshot::channel();
         let (done, ended) = channel();
+        let file = file.to_owned();
         let network = domain.map(|domain| Arc::new(domain.join(true)));
         let socket = config.admin_socket.clone().unwrap();
         runtime.spawn(async move {
-            let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
+            let source: ConfigSource = Arc::new(move || config::load(&file, &|_| None));
+            let options = RunOptions { ready: Some(ready), source: Some(source), ..RunOptions::default() };
             let stopped = async {
                 let _ = stopped.await;
             };
@@ -57,8 +60,18 @@ impl Node {
     }
 
     pub(crate) fn status(&self) -> Value {
+        self.ask(&AdminRequest::Status.to_line())
+    }
+
+    /// Lets the node read its file again.
+    pub(crate) fn reload(&self) {
+        let report = self.ask(&AdminRequest::Reload.to_line());
+        assert!(report["ok"]["changed"].as_array().is_some_and(|changed| !changed.is_empty()), "{report}");
+    }
+
+    fn ask(&self, request: &str) -> Value {
         let mut stream = UnixStream::connect(&self.socket).unwrap();
-        stream.write_all(b"status\n").unwrap();
+        stream.write_all(request.as_bytes()).unwrap();
         let mut text = String::new();
         stream.read_to_string(&mut text).unwrap();
         serde_json::from_str(&text).unwrap()

@@ -15,15 +15,17 @@ use super::Core;
 use crate::clock::now;
 use crate::drops::NodeDrop;
 use crate::link::direct_address::HostAddress;
+use crate::link::mapping_report::MappingReport;
 
 impl<N: RosNetwork> Core<N> {
-    /// Sets the peers that may have direct links.
-    pub(super) fn set_direct(&mut self, permitted: Grantees) {
+    /// Sets the peers that may have direct links, and whether a port may be mapped for them.
+    pub(super) fn set_direct(&mut self, permitted: Grantees, maps_port: bool) {
         let links = &self.links;
         let peer_of = |link| links.get(link).map(|entry| entry.peer().clone());
         for link in self.direct.set_permitted(permitted, peer_of) {
             self.close_not_permitted(link);
         }
+        self.direct.set_port_mapping(maps_port);
         self.endpoint.offer_paths(now(), self.direct.is_offered());
     }
 
@@ -62,6 +64,10 @@ impl<N: RosNetwork> Core<N> {
 
     pub(super) fn host_addresses(&mut self, addresses: Vec<HostAddress>) {
         self.direct.set_host(Instant::now(), addresses);
+    }
+
+    pub(super) fn port_mapped(&mut self, report: MappingReport) {
+        self.direct.set_mapping(Instant::now(), report);
     }
 
     /// Passes on the addresses from which routers see this node come.

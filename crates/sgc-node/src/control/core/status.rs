@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::time::Instant;
 
 use sgc_ros::{RosNetwork, RouteStatus, Routes};
 use sgc_router::LinkId;
@@ -9,7 +10,9 @@ use sgc_session::NoDirectPath;
 use sgc_wire::NodeId;
 
 use super::Core;
-use crate::admin::status::{LinkStatus, NameStatus, NotDirect, RouteLine, RouterLine, Status};
+use crate::admin::status::{
+    LinkStatus, NameStatus, NotDirect, PortMappingStatus, RouteLine, RouterLine, Status,
+};
 use crate::control::parts::link_table::LinkEntry;
 use crate::data::stats::CountDrops;
 use crate::drops::NodeDrop;
@@ -32,6 +35,7 @@ impl<N: RosNetwork> Core<N> {
             links: links.collect(),
             routers: self.board.snapshot(),
             not_direct: self.direct.relayed().map(|(peer, why)| self.not_direct(&peer, why)).collect(),
+            port_mapping: PortMappingStatus::new(self.direct.mapping(), Instant::now()),
             ipv6: source_towards(IPV6_INTERNET).map(|ip| ip.to_string()),
             routes: self.routes.iter().flat_map(Routes::status).map(|route| self.route_line(route)).collect(),
             alerts: self.alerts(),

@@ -3,7 +3,8 @@
 //! [`sgc_session::DirectPaths`] decides. This part has the sockets, and knows which links are direct.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
+use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
@@ -12,10 +13,11 @@ use sgc_session::{DirectOutput, DirectPaths, LocalAddress, NoDirectPath};
 use sgc_transport::{CheckDatagram, DirectHandle};
 use sgc_trust::{Grantees, VerifiedPeer};
 use sgc_wire::{CandidateKind, NodeId, PATH_CANDIDATES_MAX, PathOffer, PathQuestion};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tracing::debug;
 
 use crate::link::direct_address::{DirectDial, HostAddress};
+use crate::link::mapping_report::{MappingOff, MappingReport, MappingWish};
 use crate::link::roaming::source_towards;
 
 /// Most reflexive addresses that peers are told; routers at several places may see several.
@@ -29,6 +31,8 @@ const SUPERSEDED_MAX: Duration = Duration::from_secs(10);
 pub(crate) struct DirectEnds {
     pub(crate) handle: DirectHandle,
     pub(crate) dials: mpsc::Sender<DirectDial>,
+    /// Whether a port is to be mapped. The mapping ends with the sender.
+    pub(crate) mapping: watch::Sender<MappingWish>,
 }
 
 /// A direct link that is up.
@@ -50,6 +54,11 @@ pub(crate) struct DirectLinks {
     links: BTreeMap<LinkId, DirectLink>,
     host: Vec<HostAddress>,
     reflexive: BTreeSet<SocketAddr>,
+    /// The last IPv4 addresses that routers saw. They stay while no router is linked.
+    seen_v4: BTreeSet<SocketAddr>,
+    /// The configuration permits a port mapping.
+    maps_port: bool,
+    mapping: MappingReport,
 }
 
 impl DirectLinks {
@@ -61,6 +70,9 @@ impl DirectLinks {
             links: BTreeMap::new(),
             host: Vec::new(),
             reflexive: BTreeSet::new(),
+            seen_v4: BTreeSet::new(),
+            maps_port: false,
+            mapping: MappingReport::off(MappingOff::NoDirectLinks),
         }
     }
 
@@ -76,8 +88,48 @@ impl DirectLinks {
         peer_of: impl Fn(LinkId) -> Option<VerifiedPeer>,
     ) -> Vec<LinkId> {
         self.permitted = permitted;
+        self.wish_mapping();
         let is_gone = |link: &LinkId| peer_of(*link).is_some_and(|peer| self.permitted.find(&peer).is_none());
         self.links.keys().copied().filter(is_gone).collect()
+    }
+
+    /// Sets whether the configuration permits a port mapping.
+    pub(crate) fn set_port_mapping(&mut self, maps_port: bool) {
+        self.maps_port = maps_port;
+        self.wish_mapping();
+    }
+
+    /// Sets the state of the port mapping.
+    pub(crate) fn set_mapping(&mut self, now: Instant, report: MappingReport) {
+        let external = |report: &MappingReport| report.mapping.map(|(mapping, _)| mapping.external);
+        let is_same = external(&self.mapping) == external(&report);
+        self.mapping = report;
+        if !is_same {
+            self.addresses_changed(now);
+        }
+    }
+
+    /// Returns the state of the port mapping.
+    pub(crate) fn mapping(&self) -> &MappingReport {
+        &self.mapping
+    }
+
+    /// Tells the task of port mappings whether one is wanted.
+    fn wish_mapping(&self) {
+        let Some(ends) = &self.ends else { return };
+        let wish = if !self.is_offered() {
+            MappingWish::Off(MappingOff::NoDirectLinks)
+        } else if !self.maps_port {
+            MappingWish::Off(MappingOff::Configured)
+        } else {
+            let port = ends.handle.ports().0.and_then(NonZeroU16::new);
+            mapping_wish(port, &self.host, &self.seen_v4)
+        };
+        ends.mapping.send_if_modified(|known| {
+            let is_new = *known != wish;
+            *known = wish;
+            is_new
+        });
     }
 
     /// Returns `true` if a peer may have a direct link.
@@ -97,13 +149,22 @@ impl DirectLinks {
         let reflexive: BTreeSet<_> = reflexive.collect();
         if self.reflexive != reflexive && !reflexive.is_empty() {
             self.reflexive = reflexive;
+            let seen_v4: BTreeSet<_> = self.reflexive.iter().filter(|seen| seen.is_ipv4()).copied().collect();
+            if !seen_v4.is_empty() {
+                self.seen_v4 = seen_v4;
+            }
             self.addresses_changed(now);
         }
     }
 
     fn addresses_changed(&mut self, now: Instant) {
         let Some(ends) = &self.ends else { return };
-        let local = local_addresses(&self.host, &self.reflexive, ends.handle.ports());
+        let mapped = self
+            .mapping
+            .mapping
+            .map(|(mapping, _)| (SocketAddr::V4(mapping.external), IpAddr::V4(mapping.target.host)));
+        let local = local_addresses(&self.host, mapped, &self.reflexive, ends.handle.ports());
+        self.wish_mapping();
         debug!(?local, "addresses for direct links");
         self.paths.set_local(now, local);
     }
@@ -251,9 +312,20 @@ impl DirectLinks {
     }
 }
 
-/// Returns the addresses that peers are told: those that routers see, then those of interfaces.
+/// Wants a mapping of the port if a router sees another address than those of this host.
+fn mapping_wish(port: Option<NonZeroU16>, host: &[HostAddress], seen: &BTreeSet<SocketAddr>) -> MappingWish {
+    let is_own = |seen: &SocketAddr| host.iter().any(|host| host.ip == seen.ip());
+    match port {
+        Some(port) if !seen.iter().all(is_own) => MappingWish::For { port, seen: seen.clone() },
+        _ => MappingWish::Off(MappingOff::NoNat),
+    }
+}
+
+/// Returns the addresses that peers are told: that of the port mapping, which admits every peer, those that routers see,
+/// then those of interfaces. `mapped` has the address of the interface, too.
 fn local_addresses(
     host: &[HostAddress],
+    mapped: Option<(SocketAddr, IpAddr)>,
     reflexive: &BTreeSet<SocketAddr>,
     ports: (Option<u16>, Option<u16>),
 ) -> Vec<LocalAddress> {
@@ -263,15 +335,22 @@ fn local_addresses(
     };
     let hosts: Vec<_> = host.iter().filter_map(base).collect();
     // The first interface of its family stands for all: the socket is the same.
-    let seen = |address: &SocketAddr| {
-        let base = *hosts.iter().find(|host| host.is_ipv4() == address.is_ipv4())?;
-        let is_seen = !hosts.contains(address);
-        is_seen.then_some(LocalAddress { kind: CandidateKind::ServerReflexive, address: *address, base })
+    let translated = |address: &SocketAddr, base: Option<&SocketAddr>| {
+        let is_translated = !hosts.contains(address);
+        let (kind, address, base) = (CandidateKind::ServerReflexive, *address, *base?);
+        is_translated.then_some(LocalAddress { kind, address, base })
     };
+    let seen = |address: &SocketAddr| {
+        translated(address, hosts.iter().find(|host| host.is_ipv4() == address.is_ipv4()))
+    };
+    let external = mapped.map(|(external, _)| external);
+    let mapped =
+        mapped.and_then(|(external, ip)| translated(&external, hosts.iter().find(|host| host.ip() == ip)));
     let of_host =
         |address: &SocketAddr| LocalAddress { kind: CandidateKind::Host, address: *address, base: *address };
-    let reflexive = reflexive.iter().filter_map(seen).take(REFLEXIVE_MAX);
-    reflexive.chain(hosts.iter().map(of_host)).take(PATH_CANDIDATES_MAX).collect()
+    let others = reflexive.iter().filter(|address| Some(**address) != external);
+    let reflexive = others.filter_map(seen).take(REFLEXIVE_MAX);
+    mapped.into_iter().chain(reflexive).chain(hosts.iter().map(of_host)).take(PATH_CANDIDATES_MAX).collect()
 }
 
 #[cfg(test)]
@@ -284,7 +363,7 @@ mod tests {
         let host = host.map(|ip| HostAddress { ip: ip.parse().unwrap(), prefix: 24 }).to_vec();
         let addresses = |texts: &[&str]| texts.iter().map(|text| text.parse().unwrap()).collect();
         let told = |reflexive: &[&str], ports| {
-            let local = local_addresses(&host, &addresses(reflexive), ports);
+            let local = local_addresses(&host, None, &addresses(reflexive), ports);
             local.iter().map(|local| (local.address.to_string(), local.base.to_string())).collect::<Vec<_>>()
         };
         let pair = |address: &str, base: &str| (address.to_owned(), base.to_owned());
@@ -306,5 +385,49 @@ mod tests {
             told(&["203.0.113.9:1"], (None, Some(6000))),
             [pair("[2001:db8::7]:6000", "[2001:db8::7]:6000")]
         );
+    }
+
+    #[test]
+    fn port_is_mapped_only_if_a_router_sees_a_nat() {
+        let host = [HostAddress { ip: "10.0.0.7".parse().unwrap(), prefix: 24 }];
+        let wish = |seen: &[&str], port| {
+            mapping_wish(
+                NonZeroU16::new(port),
+                &host,
+                &seen.iter().map(|text| text.parse().unwrap()).collect(),
+            )
+        };
+        let off = MappingWish::Off(MappingOff::NoNat);
+        assert_eq!(wish(&[], 5000), off);
+        assert_eq!(wish(&["10.0.0.7:5000"], 5000), off);
+        assert_eq!(wish(&["203.0.113.9:1"], 0), off);
+        // A router on the same network and one beyond the NAT.
+        assert!(matches!(wish(&["10.0.0.7:5000", "203.0.113.9:1"], 5000), MappingWish::For { .. }));
+        assert_ne!(
+            wish(&["203.0.113.9:1"], 5000),
+            wish(&["203.0.113.9:2"], 5000),
+            "the gateway is asked again"
+        );
+    }
+
+    #[test]
+    fn mapped_address_comes_first_and_pushes_none_out() {
+        let host = ["10.0.0.7", "192.0.2.7"];
+        let host = host.map(|ip| HostAddress { ip: ip.parse().unwrap(), prefix: 24 });
+        let told = |mapped: (&str, &str), reflexive: &[&str]| {
+            let mapped = (mapped.0.parse().unwrap(), mapped.1.parse().unwrap());
+            let reflexive = reflexive.iter().map(|text| text.parse().unwrap()).collect();
+            let local = local_addresses(&host, Some(mapped), &reflexive, (Some(5000), None));
+            local.iter().map(|local| (local.address.to_string(), local.base.to_string())).collect::<Vec<_>>()
+        };
+        let seen = ["203.0.113.9:1", "203.0.113.9:2", "203.0.113.9:3", "203.0.113.9:4"];
+        let all = told(("203.0.113.9:5000", "192.0.2.7"), &seen);
+        assert_eq!(all[0], ("203.0.113.9:5000".to_owned(), "192.0.2.7:5000".to_owned()));
+        assert_eq!(all.len(), 1 + REFLEXIVE_MAX + host.len());
+        // The NAT gave the node's own packets the same mapping.
+        assert_eq!(told(("203.0.113.9:2", "192.0.2.7"), &seen[..3]).len(), 1 + 2 + host.len());
+        // Of an interface that is gone, or a gateway that names the host's own address.
+        assert_eq!(told(("203.0.113.9:5000", "192.0.2.9"), &[]).len(), host.len());
+        assert_eq!(told(("10.0.0.7:5000", "10.0.0.7"), &[]).len(), host.len());
     }
 }

@@ -372,6 +372,7 @@ impl Reloader {
             member_names,
             observers,
             direct: rules.direct.clone(),
+            port_mapping: rules.port_mapping,
             operators,
             rights,
             peer_rate,
@@ -548,6 +549,7 @@ fn merged(before: Config, read: Config) -> Config {
         metrics: read.metrics,
         observers: read.observers,
         direct: read.direct,
+        port_mapping: read.port_mapping,
         peer_rate: read.peer_rate,
         audit: read.audit,
         rotation: read.rotation,
@@ -652,6 +654,10 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     }
     if old.direct != new.direct {
         lines.push("with whom direct links are made changed".to_owned());
+    }
+    if old.port_mapping != new.port_mapping {
+        let is_asked = if new.port_mapping { "is asked" } else { "is no longer asked" };
+        lines.push(format!("the gateway {is_asked} to map a port"));
     }
     if old.operators != new.operators {
         lines.push("who may change the fleet here changed".to_owned());

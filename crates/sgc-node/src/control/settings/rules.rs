@@ -36,6 +36,8 @@ pub(crate) struct Rules {
     pub(crate) observers: Grantees,
     /// The peers that may have direct links.
     pub(crate) direct: Grantees,
+    /// Whether the gateway is asked to map a port for these.
+    pub(crate) port_mapping: bool,
     /// The nodes that may change the fleet, if this node is its authority.
     pub(crate) operators: Grantees,
     /// The rights in the words of the configuration, for observers.
@@ -73,6 +75,7 @@ impl Rules {
         rules.members = MemberNames::from_config(config, identity);
         rules.rights = Arc::new(policy::written_rights(config, &rules.partners));
         rules.observers = policy::grantees(&config.observers(), identity, &rules.partners);
+        rules.port_mapping = config.port_mapping;
         rules.direct = policy::grantees(&config.direct, identity, &rules.partners);
         let operators =
             config.authority.as_ref().map(|authority| &authority.operators[..]).unwrap_or_default();
