@@ -139,6 +139,41 @@ try {
   assert.equal(await stranger.locator("#nodes tr").count(), 0);
   await stranger.close();
 
+  begin("direct and relayed peers");
+  const network = await browser.newPage();
+  listen(network);
+  // These nodes have no data to exchange, so the server's document gets the peers of one.
+  await network.route("**/api/fleet*", async (route) => {
+    const response = await route.fetch();
+    const answer = await response.json();
+    const member = (name) => answer.view.fleet.nodes.find((node) => node.name === name)?.member?.id;
+    const report = answer.view?.fleet.nodes.find((node) => node.name === "arm-07")?.report;
+    if (report) {
+      assert.deepEqual([report.not_direct, report.not_direct_omitted, report.links[0].direct], [[], 0, false]);
+      report.links.push({ ...report.links[0], peer: member("arm-08"), direct: true });
+      report.not_direct = [
+        { peer: member("busy"), name: "B", reason: "blocked" },
+        { peer: "0123456789", name: "elsewhere", reason: "of_tomorrow" },
+      ];
+      report.not_direct_omitted = 3;
+    }
+    await route.fulfill({ response, json: answer });
+  });
+  await network.goto(look);
+  await network.locator('#nodes tr[data-key="1 arm-07"] button').click(PATIENCE);
+  await network.locator("#details-title", { hasText: "arm-07" }).waitFor(PATIENCE);
+  assert.match(await network.locator("#links tr", { hasText: "arm-08" }).textContent(), /^arm-08itself/);
+  const relayed = await network.locator("#not-direct tr").allTextContents();
+  assert.equal(relayed.length, 2);
+  assert.match(relayed[0], /^busyno packet passes between the two networks.*run sgc netcheck at both nodes/);
+  assert.match(relayed[1], /^elsewherea reason of another version/);
+  assert.equal(await network.locator("#not-direct-more").textContent(), "and 3 more");
+  assert.equal(await network.locator("#map line.direct").count(), 1);
+  await network.locator('#nodes tr[data-key="1 arm-08"] button').click(PATIENCE);
+  await network.locator("#details-title", { hasText: "arm-08" }).waitFor(PATIENCE);
+  assert.equal(await network.locator("#not-direct").isVisible(), false);
+  await network.close();
+
   begin("a page that only looks");
   const looking = await browser.newPage();
   listen(looking);

@@ -9,6 +9,7 @@ use sgc_diagnosis::refusals::drop_meaning;
 use sgc_diagnosis::rights::Recipients;
 use sgc_diagnosis::{Step, Verdict};
 use sgc_node::admin::AuditAnswer;
+use sgc_node::admin::not_direct::NotDirectReason;
 use sgc_node::admin::report::ReportEvent;
 use sgc_node::audit::AUDIT_ID_CHARS;
 
@@ -30,6 +31,16 @@ pub(crate) struct FleetView<'a> {
     audit: &'a AuditView,
     /// The meaning of each counter.
     meanings: BTreeMap<&'a str, String>,
+    /// The reasons why there is no direct link.
+    not_direct: BTreeMap<NotDirectReason, NotDirectView>,
+}
+
+/// A reason why there is no direct link.
+#[derive(Debug, Serialize)]
+struct NotDirectView {
+    why: String,
+    /// The remedy; empty if there is none to name.
+    fix: &'static str,
 }
 
 impl<'a> FleetView<'a> {
@@ -38,7 +49,22 @@ impl<'a> FleetView<'a> {
         let reasons = reports.flat_map(|report| report.drops.keys());
         let meanings = reasons.map(|reason| (reason.as_str(), drop_meaning(reason))).collect();
         let (faults, known, recipients) = (fleet.attention(), fleet.known(), fleet.recipients());
-        Self { seq, error, summary: fleet.summary(), fleet, faults, known, recipients, audit, meanings }
+        let reasons = NotDirectReason::ALL.into_iter().chain([NotDirectReason::Other]);
+        let not_direct = reasons
+            .map(|reason| (reason, NotDirectView { why: reason.to_string(), fix: reason.fix() }))
+            .collect();
+        Self {
+            seq,
+            error,
+            summary: fleet.summary(),
+            fleet,
+            faults,
+            known,
+            recipients,
+            audit,
+            meanings,
+            not_direct,
+        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use sgc_node::admin::not_direct::NotDirectReason;
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{Graph, Interface};
 
@@ -162,6 +163,15 @@ pub(crate) enum ShareFinding {
     Leaves {
         over: Vec<Hop>,
     },
+    /// These nodes have it over no router.
+    Direct {
+        to: Vec<String>,
+    },
+    /// There is no direct link to these nodes.
+    Relayed {
+        to: Vec<String>,
+        reason: NotDirectReason,
+    },
     /// A node's subscribers have another definition of the type.
     DefinitionsDiffer {
         type_name: String,
@@ -277,6 +287,19 @@ pub(crate) enum UseFinding {
         owner: String,
         next: Hop,
         rtt_us: u32,
+    },
+    /// No router is on the path.
+    Direct {
+        owner: String,
+    },
+    /// A direct link to the owner is up, and routing takes another path.
+    NotOverDirect {
+        owner: String,
+    },
+    /// There is no direct link to the owner.
+    Relayed {
+        owner: String,
+        reason: NotDirectReason,
     },
     NoBranch,
     /// Nothing on the local network answers for the owner.

@@ -248,6 +248,11 @@ impl FleetStatus {
         };
         let links = report.links.iter().map(|link| self.link_row(link)).collect();
         section("Links", &["to", "by", "round trip", "lost", "dialled by"], links, report.links_omitted);
+        if !report.not_direct.is_empty() {
+            let rows = report.not_direct.iter().map(|peer| vec![peer.name.clone(), peer.reason.to_string()]);
+            let omitted = report.not_direct_omitted;
+            section("Over routers", &["peer", "why not direct"], rows.collect(), omitted);
+        }
         if !report.routers.is_empty() {
             let rows = report.routers.iter().map(|router| {
                 let failure = router.last_failure.clone().unwrap_or_default();
@@ -359,7 +364,7 @@ impl FleetStatus {
     fn links(&self, report: &NodeReport) -> String {
         let named = report.links.iter().take(LINKS_NAMED).map(|link| {
             let round_trip = if link.silent { "silent".to_owned() } else { output::millis(link.rtt_us) };
-            let direct = if self.is_router(&link.peer) { "" } else { " direct" };
+            let direct = if self.is_direct(link) { " direct" } else { "" };
             format!("{} {round_trip}{direct}", self.name_of(link))
         });
         let mut named: Vec<_> = named.collect();
@@ -373,7 +378,7 @@ impl FleetStatus {
     fn link_row(&self, link: &ReportLink) -> Vec<String> {
         vec![
             self.name_of(link),
-            if self.is_router(&link.peer) { "a router" } else { "itself" }.to_owned(),
+            if self.is_direct(link) { "itself" } else { "a router" }.to_owned(),
             if link.silent { "silent".to_owned() } else { output::millis(link.rtt_us) },
             lost(link),
             if link.dialled { "this node" } else { "the other" }.to_owned(),
@@ -405,6 +410,11 @@ impl FleetStatus {
 
     fn known_name(&self, id: &str) -> Option<String> {
         self.known.get(id).map(|(name, _)| name.clone())
+    }
+
+    /// Returns `true` if a link leads to the node itself and not to a router. Nodes of earlier versions do not tell it.
+    fn is_direct(&self, link: &ReportLink) -> bool {
+        link.direct || !self.is_router(&link.peer)
     }
 
     /// Returns `true` if a node is known to route for others.
@@ -572,6 +582,7 @@ fn dropped(topic: &ReportTopic) -> String {
 
 #[cfg(test)]
 mod tests {
+    use sgc_node::admin::not_direct::{NotDirectPeer, NotDirectReason};
     use sgc_node::admin::report::{ReportRights, ReportRouter, ReportRule};
     use sgc_node::alerts::Alert;
 
@@ -843,6 +854,9 @@ mod tests {
         let mut report = report("arm", &[("11", 23_000), ("33", 500)]);
         report.drops = [("no_subscriber".to_owned(), 7)].into();
         report.topics_omitted = 4;
+        let peer =
+            NotDirectPeer { name: "desk".into(), reason: NotDirectReason::Blocked, ..Default::default() };
+        (report.not_direct, report.not_direct_omitted) = (vec![peer], 3);
         let fleet = fleet(vec![answer_of(report), error_of("desk", "not in reach")]);
         let of = |name: &str| {
             let node = fleet.nodes.iter().find(|node| node.name == name);
@@ -854,6 +868,8 @@ mod tests {
             "desk   itself    0.50 ms",
             "share  /odom  ?",
             "and 4 more",
+            "desk  no packet passes between the two networks",
+            "and 3 more",
             "no_subscriber  7",
         ] {
             assert!(arm.contains(part), "{part:?} is not in {arm}");

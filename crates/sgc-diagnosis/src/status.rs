@@ -55,6 +55,8 @@ pub struct Status {
 struct NotDirect {
     name: String,
     why: String,
+    /// The remedy; empty if there is none to name.
+    fix: String,
 }
 
 /// The port that a node's gateway maps for direct links. The state of an older node is empty.
@@ -127,6 +129,7 @@ struct GatewayClient {
 pub struct Link {
     /// Node id of the peer.
     pub peer: String,
+    name: Option<String>,
     /// Address of the peer.
     pub remote: String,
     pub(crate) url: Option<String>,
@@ -245,9 +248,10 @@ impl Status {
             self.links.iter().map(Link::row).collect(),
         );
         if !self.not_direct.is_empty() {
-            let rows =
-                self.not_direct.iter().map(|peer| vec![peer.name.as_str().into(), peer.why.as_str().into()]);
-            section("Over routers", &["peer", "why not direct"], rows.collect());
+            let rows = self.not_direct.iter().map(|NotDirect { name, why, fix }| {
+                vec![name.as_str().into(), why.as_str().into(), fix.as_str().into()]
+            });
+            section("Over routers", &["peer", "why not direct", "do"], rows.collect());
         }
         let over: Vec<_> = self.links.iter().filter(|l| l.peer_slowed + l.peer_dropped > 0).collect();
         if !over.is_empty() {
@@ -369,8 +373,9 @@ impl Link {
         vec![self.short_peer(), self.peer_slowed.to_string().into(), self.peer_dropped.to_string().into()]
     }
 
+    /// Returns the peer's name, or the beginning of its id.
     fn short_peer(&self) -> Toned {
-        self.peer.chars().take(8).collect::<String>().into()
+        self.name.clone().unwrap_or_else(|| self.peer.chars().take(8).collect()).into()
     }
 }
 

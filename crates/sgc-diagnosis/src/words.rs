@@ -291,6 +291,10 @@ impl fmt::Display for ShareFinding {
                 "granted, but no branch leads away from this node: the way broke and is being looked for",
             ),
             Self::Leaves { over } => write!(f, "it leaves over {}", listed(over)),
+            Self::Direct { to } => write!(f, "directly to {}: no router stands in between", to.join(", ")),
+            Self::Relayed { to, reason } => {
+                write!(f, "over a router, since there is no direct link to {}: {reason}", to.join(", "))
+            }
             Self::DefinitionsDiffer { type_name, here, there, node } => write!(
                 f,
                 "the definitions of {type_name} differ: {} here, {} at {node}",
@@ -337,6 +341,7 @@ impl ShareFinding {
                 "on the other node: [[use]] from = \"{node}\", {kind} = \"{topic}\"; if it is there, run `sgc why {topic}` \
                  there"
             ),
+            Self::Relayed { reason, .. } => reason.fix().into(),
             Self::NoBranch => ASK_AGAIN_OR_SILENT.into(),
             Self::DefinitionsDiffer { .. } => ONE_VERSION.into(),
             Self::NoCaller => ASK_AGAIN_OR_DDS_LOG.into(),
@@ -346,6 +351,7 @@ impl ShareFinding {
             | Self::Unheard { .. }
             | Self::Granted { .. }
             | Self::Leaves { .. }
+            | Self::Direct { .. }
             | Self::Called
             | Self::Published { .. }
             | Self::Written { .. } => return None,
@@ -410,6 +416,15 @@ impl fmt::Display for UseFinding {
             Self::Granted { owner, type_name } => write!(f, "{owner} granted it [{type_name}]"),
             Self::Route { owner, next, rtt_us } => {
                 write!(f, "the way to {owner}: {next}, {} round trip", output::millis((*rtt_us).into()))
+            }
+            Self::Direct { owner } => write!(f, "directly: no router stands between this node and {owner}"),
+            Self::NotOverDirect { owner } => write!(
+                f,
+                "over a router, although a direct link to {owner} is up: that is faster, or other nodes get it over the \
+                 router as well, and it leaves {owner} once"
+            ),
+            Self::Relayed { owner, reason } => {
+                write!(f, "over a router, since there is no direct link to {owner}: {reason}")
             }
             Self::NoBranch => {
                 f.write_str("granted, but no branch leads here: the way broke and is being looked for")
@@ -491,6 +506,7 @@ impl UseFinding {
                 },
                 str::to_owned,
             ),
+            Self::Relayed { reason, .. } => reason.fix().into(),
             Self::NoRoute { owner } => format!("is {owner} running and linked? `sgc status` there"),
             Self::Unanswered { .. } => ASK_AGAIN.into(),
             Self::NoBranch => ASK_AGAIN_OR_SILENT.into(),
@@ -509,6 +525,8 @@ impl UseFinding {
             | Self::Listed { .. }
             | Self::Granted { .. }
             | Self::Route { .. }
+            | Self::Direct { .. }
+            | Self::NotOverDirect { .. }
             | Self::Answered { .. }
             | Self::Received { .. }
             | Self::Published { .. } => return None,

@@ -37,7 +37,7 @@ pub use drops::{DropReason, RouterDrop};
 pub use fib::{FibEntry, Tree};
 pub use limits::Limits;
 pub use link_id::LinkId;
-pub use links::{DirectReach, LinkQuality, Neighbour, clocks_differ};
+pub use links::{DirectReach, LinkQuality, Neighbour, PathKind, clocks_differ};
 pub use mapping::MappingKind;
 pub use output::{LinkClose, Output};
 pub use router::{Router, RouterStats};

@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_router::{
-    DirectReach, FibEntry, Limits, LinkId, LinkQuality, MappingKind, Neighbour, Output, Router, RouterConfig,
+    DirectReach, FibEntry, Limits, LinkId, LinkQuality, MappingKind, Neighbour, Output, PathKind, Router,
+    RouterConfig,
 };
 use sgc_testkit::{Clock, Member, identity, invited};
 use sgc_trust::{Identity, name_of, operations_blind};
@@ -396,6 +397,31 @@ fn a_proxy_says_only_where_it_is_itself() {
     bench.says(4, 4, &[(1, 10)], true);
     bench.owner_says(4, 0, &[(1, 10)]);
     assert_eq!(bench.dropped, ["not_owner", "not_owner"]);
+}
+
+#[test]
+fn only_the_required_kind_of_path_counts_for_a_name() {
+    let mut bench = Bench::with_kind(MappingKind::Flood, Limits::default(), false);
+    let neighbour = Neighbour { direct: Some(DirectReach::Far), ..Neighbour::from(bench.owner.as_peer()) };
+    bench.router.handle_link_up(bench.clock.now(), LinkId(4), neighbour);
+    bench.frame(4, hello(4, false));
+    let names = vec![bench.name(&A), bench.name(&B)];
+    bench.frame(0, Control::Interest { names });
+    let over = |bench: &Bench, blind| bench.route(blind).map(|(link, _)| link);
+    bench.router.require_path(bench.name(&A), Some(PathKind::Relayed));
+    let advert = bench.advert_frame(1, false, &[A, B]);
+    bench.frame(4, advert.clone());
+    assert_eq!((over(&bench, &A), over(&bench, &B)), (None, Some(4)), "it waits for a router");
+    bench.frame(1, advert);
+    assert_eq!(over(&bench, &A), Some(1));
+    bench.join(0, 1, &A);
+    assert_eq!(bench.told(), [(1, "join")]);
+    bench.router.require_path(bench.name(&A), Some(PathKind::Direct));
+    assert_eq!(over(&bench, &A), Some(4));
+    bench.link_down(4);
+    assert_eq!((over(&bench, &A), over(&bench, &B)), (None, Some(1)));
+    bench.router.require_path(bench.name(&A), None);
+    assert_eq!(over(&bench, &A), Some(1));
 }
 
 #[test]

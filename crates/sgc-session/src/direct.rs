@@ -386,6 +386,11 @@ impl DirectPaths {
         relayed.map(|(node, peer)| (*node, peer.why_not))
     }
 
+    /// Returns why there is no direct path to a peer; `None` if there is one, or nobody looks for one.
+    pub fn why_not(&self, node: &NodeId) -> Option<NoDirectPath> {
+        self.peers.get(node).filter(|peer| peer.linked.is_none()).map(|peer| peer.why_not)
+    }
+
     /// Returns `true` if this node exchanges data with a peer.
     pub fn is_wanted(&self, node: &NodeId) -> bool {
         self.peers.get(node).is_some_and(|peer| peer.is_wanted)

@@ -186,6 +186,9 @@ const linksText = (report) => {
 const lostOf = ({ sent_packets, lost_packets }) =>
   sent_packets && lost_packets ? `${((100 * lost_packets) / sent_packets).toFixed(1)} %` : "–";
 
+/** Whether a link leads to the node itself and not to a router; nodes of earlier versions do not tell it. */
+const isDirect = (link) => link.direct || !isRouter(link.peer);
+
 /** The path of a topic from its owner. */
 const pathOf = ({ via, direct }) => (!via ? "–" : direct ? "direct" : `over ${nameOfId(via)}`);
 
@@ -321,7 +324,8 @@ const showMap = () => {
       const known = lines.get(key);
       const silent = link.silent || (known?.silent ?? false);
       const lost = [known?.lost, lostOf(link)].filter((part) => part && part !== "–");
-      lines.set(key, { key, from: member.id, to: link.peer, rtt_us: link.rtt_us, silent, lost: lost[0] });
+      const direct = link.direct || (known?.direct ?? false);
+      lines.set(key, { key, from: member.id, to: link.peer, rtt_us: link.rtt_us, silent, direct, lost: lost[0] });
     }
   }
   const map = by("map");
@@ -336,13 +340,13 @@ const showMap = () => {
       line.append(svg("title"));
       return line;
     },
-    (element, { from, to, rtt_us, silent, lost }) => {
+    (element, { from, to, rtt_us, silent, direct, lost }) => {
       const [a, b] = [at.get(from), at.get(to)];
       for (const [name, value] of [["x1", a.x], ["y1", a.y], ["x2", b.x], ["y2", b.y]]) {
         setAttribute(element, name, value.toFixed(1));
       }
-      const direct = !isRouter(from) && !isRouter(to);
-      setAttribute(element, "class", [direct && "direct", silent && "silent"].filter(Boolean).join(" "));
+      const passesNoRouter = direct || (!isRouter(from) && !isRouter(to));
+      setAttribute(element, "class", [passesNoRouter && "direct", silent && "silent"].filter(Boolean).join(" "));
       const state = silent ? "silent" : `${millis(rtt_us)}${lost ? `, ${lost} lost` : ""}`;
       setText(element.firstElementChild, `${a.node.name} – ${b.node.name}: ${state}`);
     },
@@ -505,11 +509,22 @@ const showDetails = () => {
   );
   syncRows(by("links"), report?.links ?? [], (link) => link.peer, [
     { text: nameOf },
-    { text: (link) => (isRouter(link.peer) ? "a router" : "itself") },
+    { text: (link) => (isDirect(link) ? "itself" : "a router") },
     { number: true, text: (link) => (link.silent ? "silent" : millis(link.rtt_us)) },
     { number: true, text: lostOf },
     { text: (link) => (link.dialled ? "this node" : "the other") },
   ]);
+  const relayed = report?.not_direct ?? [];
+  syncRows(by("not-direct"), relayed, (peer) => peer.peer, [
+    { text: (peer) => view.known[peer.peer]?.[0] ?? peer.name },
+    { text: (peer) => view.not_direct[peer.reason]?.why ?? view.not_direct.other.why },
+    { make: () => document.createElement("span") },
+  ]);
+  relayed.forEach((peer, at) => {
+    setMarked(by("not-direct").rows[at].cells[2].firstElementChild, view.not_direct[peer.reason]?.fix ?? "");
+  });
+  const more = report?.not_direct_omitted ?? 0;
+  setText(by("not-direct-more"), more ? `and ${count(more)} more` : "");
   syncRows(by("routers"), report?.routers ?? [], (router) => router.router, [
     { text: (router) => router.router },
     { text: (router) => router.state },

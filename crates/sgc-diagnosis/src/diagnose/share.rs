@@ -1,6 +1,6 @@
 //! The walk of an interface that this node shares, from the local publishers to the far side.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use sgc_node::graph::{Graph, Interface, Share, ShareRoute};
 
@@ -79,6 +79,24 @@ pub(super) fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut 
     }
 }
 
+/// Returns the nodes that get a share directly, and those that do not with the reason.
+fn directness(graph: &Graph, route: &ShareRoute, out: &[u32]) -> Vec<ShareFinding> {
+    let is_granted = |name: &String| route.granted.contains(name);
+    let direct = graph.links.iter().filter(|link| out.contains(&link.id));
+    let direct: Vec<_> =
+        direct.filter_map(|link| link.name.clone()).filter(|name| is_granted(name)).collect();
+    let mut relayed: BTreeMap<_, Vec<String>> = BTreeMap::new();
+    for peer in graph.not_direct.iter().filter(|peer| is_granted(&peer.name)) {
+        relayed.entry(peer.reason).or_default().push(peer.name.clone());
+    }
+    let mut findings = Vec::new();
+    if !direct.is_empty() {
+        findings.push(ShareFinding::Direct { to: direct });
+    }
+    findings.extend(relayed.into_iter().map(|(reason, to)| ShareFinding::Relayed { to, reason }));
+    findings
+}
+
 /// Returns the members that a share names and this node has never heard of, misspelt ones first.
 fn unheard(graph: &Graph, share: &Share) -> Vec<ShareFinding> {
     let node = &graph.node;
@@ -123,8 +141,9 @@ fn walk_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: bool, 
         return;
     }
     if !out.is_empty() {
-        let over = out.into_iter().map(|link| Hop::over(graph, link)).collect();
+        let over = out.iter().map(|link| Hop::over(graph, *link)).collect();
         steps.push(fine(ShareFinding::Leaves { over }));
+        steps.extend(directness(graph, route, &out).into_iter().map(fine));
     }
     let far = || far_half(route.granted.join(", "), far_topic);
     if kind != Interface::Topic {

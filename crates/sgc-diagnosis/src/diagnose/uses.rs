@@ -156,6 +156,7 @@ fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
             return;
         }
         steps.push(fine(UseFinding::Route { owner: owner(), next: Hop::over(graph, link), rtt_us }));
+        steps.extend(directness(graph, used, link).map(fine));
     }
     if !line.has_branch {
         steps.push(wrong(UseFinding::NoBranch));
@@ -183,6 +184,20 @@ fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
         fine(UseFinding::Received { messages: route.messages, last_s: route.last_s })
     });
     traffic(&line, Direction::In, steps);
+}
+
+/// Returns whether the path to an owner over a link is direct, and why not. An earlier version does not tell the reason.
+fn directness(graph: &Graph, used: &Use, link: u32) -> Option<UseFinding> {
+    let owner = used.owner.clone();
+    let mut links = graph.links.iter().filter(|link| link.peer == used.owner_id);
+    if links.clone().any(|to_owner| to_owner.id == link) {
+        return Some(UseFinding::Direct { owner });
+    }
+    if links.any(|to_owner| to_owner.is_direct && !to_owner.silent) {
+        return Some(UseFinding::NotOverDirect { owner });
+    }
+    let peer = graph.not_direct.iter().find(|peer| peer.peer == used.owner_id)?;
+    Some(UseFinding::Relayed { owner, reason: peer.reason })
 }
 
 fn walk_publishing(graph: &Graph, used: &Use, route: &UseRoute, line: &NameLine, steps: &mut Walk) {

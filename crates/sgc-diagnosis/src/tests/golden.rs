@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use sgc_node::admin::not_direct::{NotDirectPeer, NotDirectReason};
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
     Endpoint, Graph, Interface, JoinState, Link, LostCalls, NameLine, Qos, ServiceCalls, Share, ShareRoute,
@@ -154,6 +155,16 @@ fn more_faults(side: &str) -> Vec<Case> {
                 g.shares[0].unheard = vec![UnheardMember { name: "deks".into(), meant: Some("desk".into()) }];
                 g.shares[0].routes[0].granted.clear();
             }),
+            ("a direct link to one of two subscribers, and a third one at a router", |g| {
+                g.shares[0].routes[0].granted = ["desk", "hut", "lamp"].map(str::to_owned).into();
+                g.links.push(Link { name: Some("desk".into()), is_direct: true, ..link(2, "deskdesk") });
+                g.names.get_mut(NAME).unwrap().out.push(2);
+                g.not_direct = not_direct(&[
+                    ("hut", NotDirectReason::Blocked),
+                    ("lamp", NotDirectReason::NotWanted),
+                    ("of_another_topic", NotDirectReason::Blocked),
+                ]);
+            }),
             ("no interface of the local network, and a pattern", |g| {
                 g.endpoints.clear();
                 g.shares[0].topic = "/**".into();
@@ -166,6 +177,22 @@ fn more_faults(side: &str) -> Vec<Case> {
         ],
         "user" => vec![
             ("nothing came yet", |g| g.uses[0].routes[0].messages = 0),
+            ("a direct link to the owner", |g| {
+                g.links.push(Link { name: Some("arm".into()), is_direct: true, ..link(2, "1d") });
+                g.names.get_mut(NAME).unwrap().way = Some((2, 900));
+            }),
+            ("a direct link to the owner that is not taken", |g| {
+                g.links.push(Link { name: Some("arm".into()), is_direct: true, ..link(2, "1d") });
+            }),
+            ("no packet passes to the owner directly", |g| {
+                g.not_direct = not_direct(&[("1d", NotDirectReason::Blocked)]);
+            }),
+            ("the owner permits no direct link", |g| {
+                g.not_direct = not_direct(&[("1d", NotDirectReason::Refused)]);
+            }),
+            ("a direct path to the owner is being looked for", |g| {
+                g.not_direct = not_direct(&[("1d", NotDirectReason::First)]);
+            }),
             ("linked to an owner that announces nothing", |g| {
                 g.uses[0].has_catalogue = false;
                 g.links[0].name = Some("arm".into());
@@ -243,6 +270,16 @@ fn more_faults(side: &str) -> Vec<Case> {
             }),
         ],
     }
+}
+
+/// Returns peers without a direct link, whose names are their ids.
+fn not_direct(peers: &[(&str, NotDirectReason)]) -> Vec<NotDirectPeer> {
+    let peer = |(name, reason): &(&str, NotDirectReason)| NotDirectPeer {
+        peer: (*name).to_owned(),
+        name: (*name).to_owned(),
+        reason: *reason,
+    };
+    peers.iter().map(peer).collect()
 }
 
 fn alerts() -> Vec<Scenario> {

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use sgc_endpoint::JoinStatus;
 use sgc_wire::{Durability, History, Kind, Liveliness, Reliability, Representations};
 
+use super::not_direct::NotDirectPeer;
 use crate::control::faults::alerts::Alert;
 
 /// Local endpoints in one document.
@@ -35,6 +36,8 @@ pub struct Graph {
     pub offers: Vec<Offer>,
     /// Links that are up.
     pub links: Vec<Link>,
+    /// Peers with which data is exchanged over routers.
+    pub not_direct: Vec<NotDirectPeer>,
     /// Searches for routers.
     pub routers: Vec<Search>,
     /// Names that are shared, used, carried or asked for here.
@@ -516,6 +519,8 @@ pub struct Link {
     pub rtt_us: u64,
     /// Whether the peer is overdue with an answer.
     pub silent: bool,
+    /// Whether it is a direct link, found without configuration.
+    pub is_direct: bool,
 }
 
 /// A search for a router.

@@ -6,6 +6,7 @@
 //! which has the description of the type, if the node knows it. Other modules carry out the requests.
 
 pub mod graph;
+pub mod not_direct;
 pub mod report;
 pub(crate) mod route_words;
 pub mod shell;
@@ -22,6 +23,7 @@ use std::time::{Duration, Instant};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::{Deserialize, Serialize};
+use sgc_router::PathKind;
 use sgc_trust::NodeName;
 use sgc_wire::{
     CRL_BYTES_MAX, Decode as _, Encode as _, Name, Operation, REPORT_INTERFACE_BYTES_MAX, ReportQuestion,
@@ -33,6 +35,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use tracing::{debug, info, warn};
 use zeroize::Zeroizing;
 
+use self::not_direct::NotDirectReason;
 use self::socket::StatusSocket;
 pub use self::socket::{
     SocketError, connect, default_socket_path, find_socket, has_hidden_services, usual_sockets,
@@ -43,7 +46,9 @@ use crate::admin::report::{NodeReport, Pong, ReportPath};
 use crate::admin::shell::{CallRequest, PublishRequest};
 use crate::clock::now;
 use crate::control::event::CoreEvent;
-use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryReport, InquiryTarget};
+use crate::control::fleet::inquiries::{
+    InquiryAnswer, InquiryError, InquiryPath, InquiryReport, InquiryTarget,
+};
 use crate::control::settings::reload::Reloader;
 use crate::data::tap::{Tap, TapMessage, TapRequest};
 use crate::gateway::Gateway;
@@ -71,6 +76,8 @@ const BIND_AGAIN_MIN: Duration = Duration::from_millis(100);
 const BIND_AGAIN_MAX: Duration = Duration::from_secs(5);
 /// Interval of checks that the socket's path still exists, since programs that tidy `/tmp` may remove it.
 const LOOK_EVERY: Duration = Duration::from_secs(5);
+/// Longest time for an answer over routers that comes after a direct one.
+const RELAYED_MAX: Duration = Duration::from_secs(4);
 /// Longest time for the rest of a request, and for reading an answer.
 const TRANSFER_MAX: Duration = Duration::from_secs(5);
 
@@ -156,10 +163,24 @@ pub struct ReportAnswer {
     pub answered_us: u64,
     /// The path over which it answered; null if there is no answer, or the node is this one.
     pub path: Option<ReportPath>,
+    /// Its answer to the same ping over routers, if it answered over a direct link; null without one.
+    pub relayed: Option<RelayedAnswer>,
+    /// Why it did not answer over a direct link; null if it did, or one is up.
+    pub not_direct: Option<NotDirectReason>,
     /// The reason why there is no answer.
     pub error: Option<String>,
     /// The remedy; empty if there is none to name.
     pub fix: String,
+}
+
+/// An answer over routers.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RelayedAnswer {
+    /// The time from the question to the answer, microseconds.
+    pub answered_us: u64,
+    /// The path.
+    pub path: ReportPath,
 }
 
 /// Header of each message of a tap: [`TapHead::BYTES`] bytes, big endian, in this order. `carried` bytes of payload
@@ -666,26 +687,51 @@ async fn report(
     }
     let mut asked = JoinSet::new();
     for (node, at) in targets {
-        let (reply, answer) = oneshot::channel();
-        let event = CoreEvent::Inquire { at, question: question.clone(), reply };
-        let begun = Instant::now();
-        events.send(event).await.map_err(|_| stopping())?;
-        asked.spawn(async move { (node, answer.await, begun.elapsed()) });
+        let (question, events) = (question.clone(), events.clone());
+        asked.spawn(async move { ask_node(node, at, &question, &events).await });
     }
     let mut answers = Vec::new();
-    while let Some(Ok((node, answer, took))) = asked.join_next().await {
-        let answered_us = took.as_micros().try_into().unwrap_or(u64::MAX);
-        let answer = answer.map_err(|_| stopping())?;
-        answers.push(ReportAnswer { answered_us, ..report_answer(node, &question, answer) });
+    while let Some(Ok(answer)) = asked.join_next().await {
+        answers.push(answer.ok_or_else(stopping)?);
     }
     answers.sort_by(|a, b| a.node.cmp(&b.node));
     Ok(answers)
 }
 
+/// Asks one node, for a ping directly and over routers if a direct link leads to it. Returns `None` if the node here is stopping.
+async fn ask_node(
+    node: String,
+    at: InquiryTarget,
+    question: &ReportQuestion,
+    events: &mpsc::Sender<CoreEvent>,
+) -> Option<ReportAnswer> {
+    let inquire = async |over| {
+        let (reply, answer) = oneshot::channel();
+        let event = CoreEvent::Inquire { at: at.clone(), question: question.clone(), over, reply };
+        let begun = Instant::now();
+        events.send(event).await.ok()?;
+        let answer = answer.await.ok()?;
+        Some((answer, begun.elapsed().as_micros().try_into().unwrap_or(u64::MAX)))
+    };
+    let (answer, answered_us) = inquire(None).await?;
+    let path = answer.as_ref().ok().and_then(|report| report.path.as_ref());
+    let has_relayed = *question == ReportQuestion::Ping && path.is_some_and(|path| path.has_relayed);
+    let mut shown = ReportAnswer { answered_us, ..report_answer(node, question, answer) };
+    let over = Some(PathKind::Relayed);
+    if has_relayed
+        && let Ok(Some((Ok(report), answered_us))) = tokio::time::timeout(RELAYED_MAX, inquire(over)).await
+    {
+        shown.relayed = report.path.map(|InquiryPath { path, .. }| RelayedAnswer { answered_us, path });
+    }
+    Some(shown)
+}
+
 fn report_answer(node: String, question: &ReportQuestion, answer: InquiryAnswer) -> ReportAnswer {
     let mut shown = ReportAnswer { node, at_ms: now().unix.0, ..ReportAnswer::default() };
     let read = answer.and_then(|InquiryReport { document, path }| {
-        shown.path = path;
+        if let Some(InquiryPath { path, not_direct, .. }) = path {
+            (shown.path, shown.not_direct) = (Some(path), not_direct);
+        }
         let is_read = match question {
             ReportQuestion::Node => {
                 shown.report = NodeReport::from_json(&document).ok();

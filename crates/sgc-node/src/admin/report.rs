@@ -14,11 +14,14 @@ use sgc_ros::Interface;
 use sgc_wire::{Kind, REPORT_BYTES_MAX, RosterRow};
 
 use crate::admin::graph::Graph;
+use crate::admin::not_direct::NotDirectPeer;
 use crate::control::faults::alerts::Alert;
 use crate::state::audit::{AuditRecord, RECENT_OF_FLEET_MAX};
 
 /// Most links in a report.
 pub const REPORT_LINKS_MAX: usize = 64;
+/// Most peers without a direct link in a report.
+pub const REPORT_NOT_DIRECT_MAX: usize = 64;
 /// Most searches for routers in a report.
 pub const REPORT_ROUTERS_MAX: usize = 16;
 /// Most shares and uses in a report.
@@ -69,6 +72,11 @@ pub struct NodeReport {
     pub links: Vec<ReportLink>,
     /// The number of further links.
     pub links_omitted: usize,
+    /// Peers with which the node exchanges data over routers, at most 64.
+    #[serde(deserialize_with = "at_most::<REPORT_NOT_DIRECT_MAX, _, _>")]
+    pub not_direct: Vec<NotDirectPeer>,
+    /// The number of further ones.
+    pub not_direct_omitted: usize,
     /// Routers that the node looks for, at most 16.
     #[serde(deserialize_with = "at_most::<REPORT_ROUTERS_MAX, _, _>")]
     pub routers: Vec<ReportRouter>,
@@ -145,6 +153,8 @@ pub struct ReportLink {
     pub silent: bool,
     /// `true` if the reporting node dialled.
     pub dialled: bool,
+    /// `true` for a direct link, found without configuration.
+    pub direct: bool,
     /// The number of packets of the transport that were sent.
     pub sent_packets: u64,
     /// The number of these that were lost. Except for datagrams, their content was sent again.
@@ -316,6 +326,7 @@ impl NodeReport {
     /// Reads the document of another node. Its texts and lists are cut to their bounds.
     pub(crate) fn from_json(document: &[u8]) -> Result<Self, serde_json::Error> {
         let mut report: Self = serde_json::from_slice(document)?;
+        report.not_direct.iter_mut().flat_map(|peer| [&mut peer.peer, &mut peer.name]).for_each(cut);
         let Self { node, version, links, routers, topics, problems, members, rights, events, .. } =
             &mut report;
         let of_links = links.iter_mut().flat_map(|link| [Some(&mut link.peer), link.name.as_mut()]);
@@ -520,6 +531,7 @@ mod tests {
 
     use super::*;
     use crate::admin::graph::{Endpoint, NameLine, Offer, Share, ShareRoute};
+    use crate::admin::not_direct::NotDirectReason;
 
     #[test]
     fn long_report_leaves_topics_out_and_says_how_many() {
@@ -552,10 +564,11 @@ mod tests {
         let many = |what: &str, n: usize| vec![what; n].join(",");
         let long = "\u{e4}".repeat(5000);
         let text = format!(
-            r#"{{"version": "{long}", "links": [{}], "routers": [{}], "topics": [{}], "problems": [{}], "alerts": [{}],
+            r#"{{"version": "{long}", "links": [{}], "not_direct": [{}], "routers": [{}], "topics": [{}], "problems": [{}], "alerts": [{}],
                 "members": [{}], "rights": {{"rules": [{}], "observers": [{}]}},
                 "events": [{}], "drops": {{{}}}}}"#,
             many("{}", 5000),
+            many(&format!(r#"{{"name": "{long}", "reason": "{long}"}}"#), 100),
             many("{}", 5000),
             many(&format!(r#"{{"state": "{long}"}}"#), 1),
             many("\"p\"", 5000),
@@ -570,14 +583,18 @@ mod tests {
         let read = NodeReport::from_json(text.as_bytes()).unwrap();
         let lengths = [
             read.links.len(),
+            read.not_direct.len(),
             read.routers.len(),
             read.problems.len(),
             read.alerts.len(),
             read.members.unwrap().len(),
             read.drops.len(),
         ];
-        let bounds = [64, 16, 32, 32, 2048, 512];
+        let bounds = [64, 64, 16, 32, 32, 2048, 512];
         assert_eq!((lengths, read.version.chars().count()), (bounds, REPORT_TEXT_CHARS_MAX));
+        let peer = &read.not_direct[0];
+        let cut = (peer.name.chars().count(), peer.reason);
+        assert_eq!(cut, (REPORT_TEXT_CHARS_MAX, NotDirectReason::Other));
         assert!(read.alerts.iter().all(|alert| *alert == Alert::Other), "they are too long");
         assert_eq!(read.topics[0].state.chars().count(), REPORT_TEXT_CHARS_MAX);
         let rights = read.rights.unwrap();

@@ -10,6 +10,7 @@ use sgc_gateway::GatewayStatus;
 use sgc_ros::RouteStatus;
 use sgc_wire::Name;
 
+use super::not_direct::{NotDirectPeer, NotDirectReason};
 use super::route_words::route_state;
 use crate::control::faults::alerts::Alert;
 use crate::data::stats::NameStats;
@@ -30,7 +31,7 @@ pub struct Status {
     pub links: Vec<LinkStatus>,
     /// The routers that the node looks for, and the state of each search.
     pub routers: Vec<RouterStatus>,
-    /// The peers with which data is exchanged over routers, although they may have a direct link.
+    /// The peers with which data is exchanged over routers, at most 256.
     pub not_direct: Vec<NotDirect>,
     /// The port that the gateway maps for direct links.
     pub port_mapping: PortMappingStatus,
@@ -68,8 +69,19 @@ pub struct NotDirect {
     pub peer: String,
     /// The name of the peer, or the beginning of its node id if this node does not know the name.
     pub name: String,
-    /// Why there is no direct link, in words.
+    /// Why there is no direct link.
+    pub reason: NotDirectReason,
+    /// The same in words.
     pub why: String,
+    /// The remedy; empty if there is none to name.
+    pub fix: &'static str,
+}
+
+impl NotDirect {
+    pub(crate) fn new(peer: NotDirectPeer) -> Self {
+        let NotDirectPeer { peer, name, reason } = peer;
+        Self { peer, name, reason, why: reason.to_string(), fix: reason.fix() }
+    }
 }
 
 /// The port that the gateway maps for direct links.
@@ -129,6 +141,8 @@ pub struct LinkStatus {
     pub id: u32,
     /// The node id of the peer.
     pub peer: String,
+    /// The name of the peer; null if this node does not know it.
+    pub name: Option<String>,
     /// The end of the certificate that the peer showed, RFC 3339.
     pub peer_until: String,
     /// The address of the peer.

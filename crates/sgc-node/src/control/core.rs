@@ -366,7 +366,7 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
             CoreEvent::DeskAnswered(answers) => self.desk_answered(answers),
             CoreEvent::Operate { at, operation, reply } => self.operate(&at, operation, reply),
-            CoreEvent::Inquire { at, question, reply } => self.inquire(&at, question, reply),
+            CoreEvent::Inquire { at, question, over, reply } => self.inquire(&at, question, over, reply),
             CoreEvent::ReportMade(question, report) => self.report_made(question, report),
             CoreEvent::NetworkJoined(routes) => self.routes = Some(*routes),
             CoreEvent::Reload {

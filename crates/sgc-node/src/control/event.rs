@@ -8,7 +8,7 @@ use sgc_ros::{
     DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosClient, RosServer, Routes, ServiceSpec, ShareRule,
     ShownEndpoint, UseRule,
 };
-use sgc_router::LinkId;
+use sgc_router::{LinkId, PathKind};
 use sgc_transport::{AnyLink, CheckDatagram};
 use sgc_trust::{CrlError, Grantees, Identity, NodeName, TrustAnchors};
 use sgc_wire::{Control, Name, NodeId, Operation, OperationAnswer, Report, ReportQuestion, SourceId};
@@ -186,6 +186,8 @@ pub(crate) enum CoreEvent {
         at: InquiryTarget,
         /// The question.
         question: ReportQuestion,
+        /// The only kind of path to take; `None` for any.
+        over: Option<PathKind>,
         /// The channel for the document.
         reply: oneshot::Sender<InquiryAnswer>,
     },

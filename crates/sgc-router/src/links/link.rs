@@ -35,6 +35,15 @@ pub enum DirectReach {
     Far,
 }
 
+/// Kinds of paths to the owner of a name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PathKind {
+    /// Over a direct link, which was found without configuration.
+    Direct,
+    /// Over another link.
+    Relayed,
+}
+
 impl From<&VerifiedPeer> for Neighbour {
     fn from(peer: &VerifiedPeer) -> Self {
         let VerifiedPeer { node_id, path, may_route, not_after, .. } = peer;
@@ -124,6 +133,11 @@ impl Link {
     /// Returns where the link leads, if it was found without configuration.
     pub(crate) fn direct(&self) -> Option<DirectReach> {
         self.direct
+    }
+
+    /// Returns the kind of the paths over the link.
+    pub(crate) fn path_kind(&self) -> PathKind {
+        if self.direct.is_some() { PathKind::Direct } else { PathKind::Relayed }
     }
 
     /// Returns the cost.

@@ -15,7 +15,7 @@ use sgc_wire::{Hello, NodeId, NodeTag, Now, PeerClock, UnixMillis};
 use smallvec::SmallVec;
 
 pub(crate) use self::link::Link;
-pub use self::link::{DirectReach, Neighbour};
+pub use self::link::{DirectReach, Neighbour, PathKind};
 pub use self::quality::LinkQuality;
 use crate::link_id::LinkId;
 use crate::output::LinkClose;

@@ -6,8 +6,8 @@ use sgc_wire::Name;
 use smallvec::SmallVec;
 
 use crate::link_id::LinkId;
-use crate::links::Links;
 use crate::links::cost::cost_differs;
+use crate::links::{Link, Links, PathKind};
 
 /// The routes to a name.
 #[derive(Debug, Default)]
@@ -21,6 +21,8 @@ struct NameRoutes {
 #[derive(Debug, Default)]
 pub(super) struct Heard {
     names: BTreeMap<Name, NameRoutes>,
+    /// The only kind of path that counts for a name.
+    required: BTreeMap<Name, PathKind>,
 }
 
 impl Heard {
@@ -56,17 +58,30 @@ impl Heard {
         self.names.remove(name);
     }
 
+    /// Lets only one kind of path count for a name, or any.
+    pub(super) fn require(&mut self, name: Name, kind: Option<PathKind>) {
+        match kind {
+            Some(kind) => self.required.insert(name, kind),
+            None => self.required.remove(&name),
+        };
+    }
+
     /// Returns the link towards the owner of a name, and the cost of the route.
     pub(super) fn next_hop(&self, links: &Links, name: &Name) -> Option<(LinkId, u32)> {
         let heard = self.names.get(name)?;
+        let required = self.required.get(name);
+        let counts =
+            |link| required.is_none_or(|kind| links.get(link).map(Link::path_kind).as_ref() == Some(kind));
         // Of several links to one neighbour, data moves to the best, even if that is no cheaper.
         let is_passed_over = |link: LinkId| {
             let best = links.get(link).and_then(|state| links.best_to(state.node()));
-            best.is_some_and(|(best, _)| best != link && heard.over.iter().any(|(l, _)| *l == best))
+            best.is_some_and(|(best, _)| {
+                best != link && counts(best) && heard.over.iter().any(|(l, _)| *l == best)
+            })
         };
         let over = |(link, cost): &(LinkId, u32)| {
             let cost = cost.saturating_add(links.cost(*link)?);
-            (!is_passed_over(*link)).then_some((cost, *link))
+            (counts(*link) && !is_passed_over(*link)).then_some((cost, *link))
         };
         let best = heard.over.iter().filter_map(over).min()?;
         // Another link is taken only if that is clearly better.

@@ -34,7 +34,7 @@ use crate::drops::DropReason;
 use crate::lease::lease_end;
 use crate::limits::Limits;
 use crate::link_id::LinkId;
-use crate::links::Peer;
+use crate::links::{PathKind, Peer};
 use crate::mapping::Mapping;
 use crate::network::Network;
 
@@ -170,6 +170,11 @@ impl Names {
             return Some((LinkId::LOCAL, 0));
         }
         if self.transit { network.next_hop_to(owner) } else { self.heard.next_hop(network.links, name) }
+    }
+
+    /// Lets only one kind of path count for a name, or any.
+    pub(crate) fn require_path(&mut self, name: Name, kind: Option<PathKind>) {
+        self.heard.require(name, kind);
     }
 
     /// Returns the number of names whose owners are in reach.

@@ -23,7 +23,7 @@ use crate::context::Context;
 use crate::drops::DropReason;
 use crate::limits::allowances::Allowances;
 use crate::link_id::LinkId;
-use crate::links::{Link, LinkQuality, Links, Neighbour};
+use crate::links::{Link, LinkQuality, Links, Neighbour, PathKind};
 use crate::names::Names;
 use crate::network::Network;
 use crate::output::{LinkClose, Output, Outputs};
@@ -267,6 +267,12 @@ impl Router {
     /// Returns the link towards the owner of `name`, and the cost of the route, microseconds of round trip.
     pub fn route(&self, name: &Name) -> Option<(LinkId, u32)> {
         self.names.next_hop(self.network(), name)
+    }
+
+    /// Lets only one kind of path count for a name of another node, or any, until the next call for the name. Has no effect
+    /// at a node that carries others' names.
+    pub fn require_path(&mut self, name: Name, kind: Option<PathKind>) {
+        self.names.require_path(name, kind);
     }
 
     /// Returns the cost of the route to a router, microseconds of round trip; `None` if it is out of reach.

@@ -50,10 +50,12 @@ fn pages_of_documents_are_what_the_types_say() {
 #[test]
 fn fields_types_and_kinds_are_those_that_serde_writes() {
     let source = "#[derive(Serialize)]\npub struct Status {\n/// One | two.\n#[serde(rename = \"type\")]\npub kind: Option<String>,\n\
-                  /// Parts.\npub parts: Vec<Part>,\n/// Sizes.\n#[serde(skip_serializing_if = \"Option::is_none\")]\n\
+                  /// Parts.\npub parts: Vec<Part>,\n/// Reason.\npub reason: Reason,\n/// Sizes.\n#[serde(skip_serializing_if = \"Option::is_none\")]\n\
                   pub sizes: Option<(u64, u64)>,\n/// Counts.\npub counts: BTreeMap<String, u64> }\n\
                   /// A part.\n#[derive(Serialize)]\n#[serde(tag = \"kind\", rename_all = \"snake_case\")]\npub enum Part {\n\
-                  /// It is old.\nTooOld {\n/// Seconds.\nage_s: u64 } }\nstruct Part2;";
+                  /// It is old.\nTooOld {\n/// Seconds.\nage_s: u64 } }\nstruct Part2;\n\
+                  /// A reason.\n#[derive(Serialize)]\n#[serde(rename_all = \"snake_case\")]\npub enum Reason {\n/// No way.\nNoWay,\n\
+                  /// Else.\n#[serde(other)]\nOther }";
     let page = page(&Repository::make(&[("crates/a/src/x.rs", source)]), &STATUS);
     for part in [
         "| `type` | string or null | One \\| two. |",
@@ -61,6 +63,8 @@ fn fields_types_and_kinds_are_those_that_serde_writes() {
         "| `sizes` | array of 2 integers; absent if none | Sizes. |",
         "| `counts` | object of integers | Counts. |",
         "\n## `parts`\n\nA part.\n",
+        "| `reason` | [`reason`](#reason) | Reason. |",
+        "\n## `reason`\n\nA reason.\n\n| string | meaning |\n|---|---|\n| `\"no_way\"` | No way. |\n",
         "| `too_old` | It is old. | `age_s` (integer): Seconds. |",
     ] {
         assert!(page.contains(part), "{part}\nis not in\n{page}");
@@ -97,11 +101,22 @@ fn page(repository: &Repository, document: &DocumentPage) -> String {
                 }
             }
             Serialised::Enum(item) => {
-                let tag = serde(&item.attrs, "tag").unwrap_or_else(|| panic!("{name} has no tag"));
-                let _ = write!(page, "\n| `{tag}` | meaning | further fields |\n|---|---|---|\n");
+                let tag = serde(&item.attrs, "tag");
+                match &tag {
+                    Some(tag) => {
+                        let _ = write!(page, "\n| `{tag}` | meaning | further fields |\n|---|---|---|\n");
+                    }
+                    None => page.push_str("\n| string | meaning |\n|---|---|\n"),
+                }
                 for variant in &item.variants {
                     // Stands for kinds of later versions, and is never written.
                     if has_serde(&variant.attrs, "other") {
+                        continue;
+                    }
+                    if tag.is_none() {
+                        assert!(variant.fields.is_empty(), "{name} has no tag");
+                        let meaning = cell(&docs(&variant.attrs));
+                        let _ = writeln!(page, "| `\"{}\"` | {meaning} |", snake(&variant.ident.to_string()));
                         continue;
                     }
                     let fields = match &variant.fields {

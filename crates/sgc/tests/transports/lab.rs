@@ -385,7 +385,7 @@ impl Lab {
     pub(crate) fn write_config(&self, node: &str, routers: &[&str], rest: &str) -> PathBuf {
         let routers: Vec<_> = routers.iter().map(|url| format!("\"{url}\"")).collect();
         let text = format!(
-            "identity = \"{node}.identity\"\n[admin]\nsocket = \"{node}.sock\"\n\
+            "identity = \"{node}.identity\"\n[admin]\nsocket = \"{node}.sock\"\nobservers = [\"*\"]\n\
              [node]\nstate = \"{node}.state\"\nrouters = [{}]\n{rest}",
             routers.join(", ")
         );

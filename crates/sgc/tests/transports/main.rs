@@ -17,6 +17,7 @@ mod lab;
 mod mapping;
 mod node;
 mod real;
+mod shown;
 #[path = "../support/mod.rs"]
 mod support;
 

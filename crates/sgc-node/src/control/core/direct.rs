@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::time::Instant;
 
 use bytes::Bytes;
-use sgc_ros::RosNetwork;
+use sgc_ros::{RosNetwork, Routes};
 use sgc_router::LinkId;
 use sgc_session::DirectOutput;
 use sgc_transport::{CheckDatagram, CloseReason};
@@ -12,6 +12,7 @@ use sgc_trust::{Grantees, VerifiedPeer};
 use sgc_wire::{Decode as _, NodeId, PathOffer, PathQuestion, RefuseReason, SinkId};
 
 use super::Core;
+use crate::admin::not_direct::{NotDirectPeer, NotDirectReason};
 use crate::clock::now;
 use crate::drops::NodeDrop;
 use crate::link::direct_address::HostAddress;
@@ -92,6 +93,26 @@ impl<N: RosNetwork> Core<N> {
         for link in self.direct.unused(at, &self.router) {
             self.links.close(link, "nothing uses the direct link".to_owned(), CloseReason::Goodbye);
         }
+    }
+
+    /// Returns the peers with which data is exchanged over routers, and why, in the order of their ids.
+    pub(super) fn not_direct(&self) -> impl Iterator<Item = NotDirectPeer> {
+        let own = self.certificates.identity().node_id();
+        let reached: BTreeSet<_> = self.links.iter().map(|(_, entry)| entry.peer().node_id).collect();
+        let names = self.routes.iter().flat_map(Routes::status).filter_map(|route| route.name);
+        let users = names.flat_map(|name| self.endpoint.granted(&name)).map(|(_, user)| user);
+        let owners = self.endpoint.data_owners().map(|owner| owner.node_id);
+        let peers: BTreeSet<_> = owners.chain(users).collect();
+        peers.into_iter().filter(move |peer| *peer != own && !reached.contains(peer)).map(|peer| {
+            let (name, reason) = (self.names.called(&peer), self.why_not_direct(&peer));
+            NotDirectPeer { peer: peer.to_string(), name, reason }
+        })
+    }
+
+    /// Returns why there is no direct link to a peer.
+    pub(super) fn why_not_direct(&self, peer: &NodeId) -> NotDirectReason {
+        let owner = self.endpoint.data_owners().find(|owner| owner.node_id == *peer);
+        self.direct.why_not(peer, owner)
     }
 
     /// Carries out what the search for direct paths wants. Returns `true` if there was something.

@@ -17,6 +17,7 @@ use crate::admin::graph::{
     Endpoint, GRAPH_ENDPOINTS_MAX, Graph, Link, NameLine, Offer, Search, Share, ShareRoute, Side,
     UnheardMember, Use, UseRoute,
 };
+use crate::admin::not_direct::NOT_DIRECT_MAX;
 use crate::admin::route_words::owner_state;
 use crate::data::tap::{Tap, TapError, TapMessage, TapQueue, TapRequest, Taps};
 
@@ -42,9 +43,11 @@ impl<N: RosNetwork> Core<N> {
                 remote: entry.remote().to_string(),
                 rtt_us: entry.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 silent,
+                is_direct: self.direct.is_direct(id),
             }
         });
         graph.links = links.collect();
+        graph.not_direct = self.not_direct().take(NOT_DIRECT_MAX).collect();
         let searches = self.board.snapshot().into_iter();
         graph.routers = searches
             .map(|s| Search { router: s.router, state: s.state.to_string(), last_failure: s.last_failure })

@@ -5,6 +5,7 @@ use std::time::Instant;
 use bytes::Bytes;
 use sgc_endpoint::{JoinStatus, RefusedBy, pack_report, unpack_report};
 use sgc_ros::{RosNetwork, RouteState, RouteStatus, Routes};
+use sgc_router::PathKind;
 use sgc_trust::{Grantees, VerifiedPeer};
 use sgc_wire::{Decode as _, Name, NodeId, RefuseReason, Report, ReportQuestion, SinkId};
 use tokio::sync::oneshot;
@@ -12,13 +13,16 @@ use tracing::warn;
 
 use super::Core;
 use crate::admin::report::{
-    NodeReport, Pong, REPORT_FAULTS_MAX, REPORT_LINKS_MAX, REPORT_ROUTERS_MAX, REPORT_TOPICS_MAX,
-    ReportEvent, ReportLink, ReportPath, ReportRights, ReportRouter, ReportTopic, keep_interface,
+    NodeReport, Pong, REPORT_FAULTS_MAX, REPORT_LINKS_MAX, REPORT_NOT_DIRECT_MAX, REPORT_ROUTERS_MAX,
+    REPORT_TOPICS_MAX, ReportEvent, ReportLink, ReportPath, ReportRights, ReportRouter, ReportTopic,
+    keep_interface,
 };
 use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::fleet::authority::Authority;
-use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryReport, InquiryTarget};
+use crate::control::fleet::inquiries::{
+    InquiryAnswer, InquiryError, InquiryPath, InquiryReport, InquiryTarget,
+};
 use crate::control::parts::link_table::LinkEntry;
 use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
@@ -196,9 +200,12 @@ impl<N: RosNetwork> Core<N> {
                 lost_packets: stats.lost_packets,
                 silent: self.router.link_cost(id).is_some_and(|(_, is_silent)| is_silent),
                 dialled: entry.url().is_some(),
+                direct: self.direct.is_direct(id),
             }
         };
         let routers = self.board.snapshot().into_iter().take(REPORT_ROUTERS_MAX);
+        let mut not_direct = self.not_direct();
+        let not_direct_shown = not_direct.by_ref().take(REPORT_NOT_DIRECT_MAX).collect();
         NodeReport {
             node: identity.node_name().to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -211,6 +218,8 @@ impl<N: RosNetwork> Core<N> {
             secret_generation: identity.naming_secrets().first().map(|secret| secret.generation),
             links: self.links.iter().take(REPORT_LINKS_MAX).map(link).collect(),
             links_omitted: self.links.iter().count().saturating_sub(REPORT_LINKS_MAX),
+            not_direct: not_direct_shown,
+            not_direct_omitted: not_direct.count(),
             routers: routers
                 .map(|search| ReportRouter {
                     router: search.router,
@@ -239,6 +248,7 @@ impl<N: RosNetwork> Core<N> {
         &mut self,
         at: &InquiryTarget,
         question: ReportQuestion,
+        over: Option<PathKind>,
         reply: oneshot::Sender<InquiryAnswer>,
     ) {
         let identity = self.certificates.identity();
@@ -262,28 +272,57 @@ impl<N: RosNetwork> Core<N> {
             }
             Ok(node) => node,
         };
-        self.inquiries.push(Instant::now(), node, question, reply);
+        let over = over.or_else(|| match question {
+            ReportQuestion::Ping => self.path_of_ping(&node),
+            ReportQuestion::Node | ReportQuestion::Interface(_) => None,
+        });
+        self.inquiries.push(Instant::now(), node, question, over, reply);
         self.next_inquiry();
     }
 
     /// Takes a report of another node.
     pub(super) fn take_report(&mut self, name: Name, report: &Report) {
-        let path = self.path_to_owner(&name).map(|PathToOwner { via, is_direct, cost_us }| {
-            let mut dialled = self.links.iter().filter(|(_, link)| link.peer().node_id == via);
-            let url = dialled.find_map(|(_, link)| link.url().map(str::to_owned));
-            let via = self.names.get(&via).or(url).unwrap_or_else(|| via.short());
-            ReportPath { via, direct: is_direct, path_us: cost_us }
-        });
+        let path = self.inquiry_path(&name);
         let document = unpack_report(report).map_err(|_| InquiryError::Unreadable);
         if self.inquiries.end(name, document.map(|document| InquiryReport { document, path })) {
-            self.endpoint.leave(now(), &name);
+            self.leave_report(&name);
             self.next_inquiry();
         }
     }
 
+    /// Returns the path to the node of a question, and whether there is another one.
+    fn inquiry_path(&self, name: &Name) -> Option<InquiryPath> {
+        let owner = self.endpoint.owner_of(name)?;
+        let PathToOwner { via, is_direct, cost_us } = self.path_to_owner(name)?;
+        let mut dialled = self.links.iter().filter(|(_, link)| link.peer().node_id == via);
+        let url = dialled.find_map(|(_, link)| link.url().map(str::to_owned));
+        let via = self.names.get(&via).or(url).unwrap_or_else(|| via.short());
+        let has_direct = self.direct.links_to(&owner).next().is_some();
+        let has_others = self.links.iter().any(|(id, _)| !self.direct.is_direct(id));
+        let not_direct = (!is_direct && !has_direct).then(|| self.why_not_direct(&owner));
+        Some(InquiryPath {
+            path: ReportPath { via, direct: is_direct, path_us: cost_us },
+            has_relayed: is_direct && has_direct && has_others && !self.router.is_transit(),
+            not_direct,
+        })
+    }
+
+    /// Returns the kind of path for a ping: it goes over a direct link if one works.
+    fn path_of_ping(&self, node: &NodeId) -> Option<PathKind> {
+        let works = |link| self.router.link_cost(link).is_some_and(|(_, is_silent)| !is_silent);
+        // Only a node that relies on its routers hears of several paths.
+        let has_choice = !self.router.is_transit() && self.direct.links_to(node).any(works);
+        has_choice.then_some(PathKind::Direct)
+    }
+
+    fn leave_report(&mut self, name: &Name) {
+        self.endpoint.leave(now(), name);
+        self.router.require_path(*name, None);
+    }
+
     pub(super) fn report_refused(&mut self, name: Name, by: RefusedBy) {
         if self.inquiries.refused(name, by) {
-            self.endpoint.leave(now(), &name);
+            self.leave_report(&name);
             self.next_inquiry();
         }
     }
@@ -295,13 +334,17 @@ impl<N: RosNetwork> Core<N> {
         let endpoint = &self.endpoint;
         let is_found = |name: &Name| !matches!(endpoint.join_status(name), None | Some(JoinStatus::Waiting));
         for name in self.inquiries.expire(at, is_found) {
-            self.endpoint.leave(now(), &name);
+            self.leave_report(&name);
         }
         self.next_inquiry();
     }
 
     fn next_inquiry(&mut self) {
-        let (at, endpoint) = (Instant::now(), &mut self.endpoint);
-        while self.inquiries.next(at, |node, question| endpoint.ask_report(now(), node, question)) {}
+        let (at, endpoint, router) = (Instant::now(), &mut self.endpoint, &mut self.router);
+        while self.inquiries.next(at, |node, question, over| {
+            let name = endpoint.ask_report(now(), node, question);
+            router.require_path(name, over);
+            name
+        }) {}
     }
 }

@@ -6,10 +6,9 @@ use std::time::Instant;
 
 use sgc_ros::{RosNetwork, RouteStatus, Routes};
 use sgc_router::LinkId;
-use sgc_session::NoDirectPath;
-use sgc_wire::NodeId;
 
 use super::Core;
+use crate::admin::not_direct::NOT_DIRECT_MAX;
 use crate::admin::status::{
     LinkStatus, NameStatus, NotDirect, PortMappingStatus, RouteLine, RouterLine, Status,
 };
@@ -34,7 +33,7 @@ impl<N: RosNetwork> Core<N> {
             uptime_s: self.started.elapsed().as_secs(),
             links: links.collect(),
             routers: self.board.snapshot(),
-            not_direct: self.direct.relayed().map(|(peer, why)| self.not_direct(&peer, why)).collect(),
+            not_direct: self.not_direct().take(NOT_DIRECT_MAX).map(NotDirect::new).collect(),
             port_mapping: PortMappingStatus::new(self.direct.mapping(), Instant::now()),
             ipv6: source_towards(IPV6_INTERNET).map(|ip| ip.to_string()),
             routes: self.routes.iter().flat_map(Routes::status).map(|route| self.route_line(route)).collect(),
@@ -112,10 +111,6 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    fn not_direct(&self, peer: &NodeId, why: NoDirectPath) -> NotDirect {
-        NotDirect { peer: peer.to_string(), name: self.names.called(peer), why: why.to_string() }
-    }
-
     fn link_status(&self, id: LinkId, entry: &LinkEntry) -> LinkStatus {
         let (stats, (lanes, bulk_lanes)) = (entry.stats(), entry.lanes());
         let (cost, silent) = self.router.link_cost(id).unwrap_or_default();
@@ -123,6 +118,7 @@ impl<N: RosNetwork> Core<N> {
         LinkStatus {
             id: id.0,
             peer: entry.peer().node_id.to_string(),
+            name: self.names.get(&entry.peer().node_id),
             peer_until: entry.peer().not_after.to_string(),
             remote: entry.remote().to_string(),
             url: entry.url().map(str::to_owned),

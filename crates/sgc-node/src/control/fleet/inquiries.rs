@@ -6,10 +6,12 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_endpoint::RefusedBy;
+use sgc_router::PathKind;
 use sgc_trust::NodeName;
 use sgc_wire::{Name, NodeId, RefuseReason, ReportQuestion};
 use tokio::sync::oneshot;
 
+use crate::admin::not_direct::NotDirectReason;
 use crate::admin::report::ReportPath;
 
 /// Most nodes that are asked at one time.
@@ -83,7 +85,17 @@ pub(crate) struct InquiryReport {
     /// The document of the report, JSON that is not verified.
     pub(crate) document: Bytes,
     /// The path to the node; `None` if it is this one.
-    pub(crate) path: Option<ReportPath>,
+    pub(crate) path: Option<InquiryPath>,
+}
+
+/// The path over which a node answered.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct InquiryPath {
+    pub(crate) path: ReportPath,
+    /// It is a direct link, and there are links to others.
+    pub(crate) has_relayed: bool,
+    /// Why there is no direct link; `None` if there is one.
+    pub(crate) not_direct: Option<NotDirectReason>,
 }
 
 /// The answer, or the reason why there is none.
@@ -103,6 +115,8 @@ pub(crate) enum InquiryTarget {
 struct Inquiry {
     node: NodeId,
     question: ReportQuestion,
+    /// The only kind of path to take.
+    over: Option<PathKind>,
     until: Instant,
     /// The time by which its name has to be found, unless it was.
     find_until: Option<Instant>,
@@ -133,31 +147,46 @@ impl Inquiries {
         now: Instant,
         node: NodeId,
         question: ReportQuestion,
+        over: Option<PathKind>,
         reply: oneshot::Sender<InquiryAnswer>,
     ) {
         let users = self.all.iter().map(|inquiry| inquiry.replies.len()).sum::<usize>();
         if users >= INQUIRIES_MAX {
             let _ = reply.send(Err(InquiryError::Full));
-        } else if let Some(known) =
-            self.all.iter_mut().find(|known| (known.node, &known.question) == (node, &question))
+        } else if let Some(known) = self
+            .all
+            .iter_mut()
+            .find(|known| (known.node, &known.question, known.over) == (node, &question, over))
         {
             known.replies.push(reply);
         } else {
             let (until, replies) = (now + INQUIRY_MAX, vec![reply]);
-            self.all.push_back(Inquiry { node, question, until, find_until: None, name: None, replies });
+            self.all.push_back(Inquiry {
+                node,
+                question,
+                over,
+                until,
+                find_until: None,
+                name: None,
+                replies,
+            });
         }
     }
 
-    /// Begins the next question to a node that is not being asked. `ask` asks it, and returns the name of the question.
-    /// Returns `true` if there was one.
-    pub(crate) fn next(&mut self, now: Instant, ask: impl FnOnce(NodeId, &ReportQuestion) -> Name) -> bool {
+    /// Begins the next question to a node that is not being asked. `ask` asks it over a kind of path, and returns the name
+    /// of the question. Returns `true` if there was one.
+    pub(crate) fn next(
+        &mut self,
+        now: Instant,
+        ask: impl FnOnce(NodeId, &ReportQuestion, Option<PathKind>) -> Name,
+    ) -> bool {
         let asked: Vec<_> = self.all.iter().filter(|i| i.name.is_some()).map(|i| i.node).collect();
         if asked.len() >= ASKED_MAX {
             return false;
         }
         let is_next = |inquiry: &&mut Inquiry| inquiry.name.is_none() && !asked.contains(&inquiry.node);
         let Some(inquiry) = self.all.iter_mut().find(is_next) else { return false };
-        inquiry.name = Some(ask(inquiry.node, &inquiry.question));
+        inquiry.name = Some(ask(inquiry.node, &inquiry.question, inquiry.over));
         inquiry.until = inquiry.until.min(now + ANSWER_MAX);
         inquiry.find_until = Some(now + FIND_MAX);
         true
@@ -242,7 +271,7 @@ mod tests {
         question: ReportQuestion,
     ) -> Receiver<InquiryAnswer> {
         let (reply, replied) = oneshot::channel();
-        inquiries.push(now, node, question, reply);
+        inquiries.push(now, node, question, None, reply);
         replied
     }
 
@@ -253,7 +282,7 @@ mod tests {
     /// Begins all that can begin. Returns the asked nodes.
     fn begin(inquiries: &mut Inquiries, now: Instant) -> Vec<NodeId> {
         let mut asked = Vec::new();
-        while inquiries.next(now, |node, _| {
+        while inquiries.next(now, |node, _, _| {
             asked.push(node);
             name(node)
         }) {}
@@ -281,6 +310,22 @@ mod tests {
         assert!(inquiries.refused(name(DESK), by) && !inquiries.refused(name(DESK), by));
         assert_eq!(of_desk.try_recv(), Ok(Err(InquiryError::Denied(by))));
         assert_eq!(inquiries.deadline(), None);
+    }
+
+    #[test]
+    fn question_over_one_kind_of_path_is_another_question() {
+        let (now, mut inquiries) = (Instant::now(), Inquiries::default());
+        for over in [None, Some(PathKind::Direct), Some(PathKind::Relayed), Some(PathKind::Direct)] {
+            inquiries.push(now, ARM, ReportQuestion::Ping, over, oneshot::channel().0);
+        }
+        let mut asked = Vec::new();
+        while inquiries.next(now, |node, _, over| {
+            asked.push(over);
+            name(node)
+        }) {
+            inquiries.end(name(ARM), Err(InquiryError::Silent));
+        }
+        assert_eq!(asked, [None, Some(PathKind::Direct), Some(PathKind::Relayed)]);
     }
 
     #[test]

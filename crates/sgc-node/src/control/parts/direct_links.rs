@@ -9,13 +9,14 @@ use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use sgc_router::{DirectReach, LinkId, Router};
-use sgc_session::{DirectOutput, DirectPaths, LocalAddress, NoDirectPath};
+use sgc_session::{DirectOutput, DirectPaths, LocalAddress};
 use sgc_transport::{CheckDatagram, DirectHandle};
 use sgc_trust::{Grantees, VerifiedPeer};
 use sgc_wire::{CandidateKind, NodeId, PATH_CANDIDATES_MAX, PathOffer, PathQuestion};
 use tokio::sync::{mpsc, watch};
 use tracing::debug;
 
+use crate::admin::not_direct::NotDirectReason;
 use crate::link::direct_address::{DirectDial, HostAddress};
 use crate::link::mapping_report::{MappingOff, MappingReport, MappingWish};
 use crate::link::roaming::source_towards;
@@ -266,9 +267,26 @@ impl DirectLinks {
         over
     }
 
-    /// Iterates over the peers with which data is exchanged over routers, with the reason.
-    pub(crate) fn relayed(&self) -> impl Iterator<Item = (NodeId, NoDirectPath)> {
-        self.paths.relayed()
+    /// Iterates over the direct links to a peer.
+    pub(crate) fn links_to(&self, peer: &NodeId) -> impl Iterator<Item = LinkId> {
+        self.links.iter().filter(|(_, link)| link.peer == *peer).map(|(id, _)| *id)
+    }
+
+    /// Returns why there is no direct link to a peer. `owner` is the peer if this node uses something of it.
+    pub(crate) fn why_not(&self, peer: &NodeId, owner: Option<&VerifiedPeer>) -> NotDirectReason {
+        if self.ends.is_none() {
+            return NotDirectReason::OnlyRoutes;
+        }
+        if self.permitted.is_empty() {
+            return NotDirectReason::Never;
+        }
+        match (owner, self.paths.why_not(peer)) {
+            (Some(owner), _) if !self.may_meet(owner) => NotDirectReason::NotPermitted,
+            (_, Some(why)) => why.into(),
+            // It is looked at twice a second.
+            (Some(_), None) => NotDirectReason::First,
+            (None, None) => NotDirectReason::NotWanted,
+        }
     }
 
     /// Returns the number of checks that were not sent, of refused candidates, and of checks for which there was no room.
