@@ -20,7 +20,7 @@ const UDP_SCHEMES: [&str; 3] = ["quic", "dtls", "udp"];
 #[derive(Debug, PartialEq, Eq, Serialize)]
 pub struct Netcheck {
     node: String,
-    /// Ways to routers that are up.
+    /// Ways to routers that are up, the nearest first.
     links: Vec<RouterView>,
     /// Routers without a link.
     not_linked: Vec<NotLinked>,
@@ -102,7 +102,8 @@ struct Ipv6 {
 impl Netcheck {
     /// Returns what the status of a node reveals of its network.
     pub fn of(status: &Status) -> Self {
-        let links: Vec<_> = status.links.iter().filter_map(RouterView::of).collect();
+        let mut links: Vec<_> = status.links.iter().filter_map(RouterView::of).collect();
+        links.sort_by_key(|link| (link.silent, link.round_trip_us));
         let not_linked = status.routers.iter().filter(|router| router.link(&status.links).is_none());
         let not_linked = not_linked.map(|router| NotLinked {
             router: router.router.clone(),
@@ -145,6 +146,7 @@ impl Netcheck {
         lines.push(Line::default());
         let port_mapping = port_mapping_line(&self.port_mapping);
         let said = [
+            self.nearest_line(),
             Some(self.udp_line()),
             self.nat_line(),
             self.mapping_line(),
@@ -153,6 +155,12 @@ impl Netcheck {
         ];
         lines.extend(said.into_iter().flatten().map(|part| Line::new([part])));
         lines
+    }
+
+    /// Returns the nearest of several routers.
+    fn nearest_line(&self) -> Option<Toned> {
+        let near = self.links.first().filter(|near| self.links.len() > 1 && !near.silent)?;
+        Some(format!("Nearest router: {}, {}.", near.url, output::millis(near.round_trip_us)).into())
     }
 
     fn udp_line(&self) -> Toned {
@@ -430,6 +438,26 @@ mod tests {
             "Port mapping: off, because no router over QUIC sees a NAT."
         );
         assert_eq!(said(json!({})), None);
+    }
+
+    #[test]
+    fn nearest_router_comes_first_and_a_silent_one_last() {
+        let at = |n: u8, rtt_us: u64, silent: bool| {
+            let mut link = link(&format!("quic://r{n}.example"), &format!("192.0.2.{n}:7447"), None);
+            (link["rtt_us"], link["silent"]) = (rtt_us.into(), silent.into());
+            link
+        };
+        let nearest = |links: &[Value]| {
+            let netcheck = netcheck(links);
+            (netcheck.links[0].url.clone(), netcheck.nearest_line().map(|line| line.to_string()))
+        };
+        let said = "Nearest router: quic://r2.example, 9.00 ms.".to_owned();
+        let near = "quic://r2.example".to_owned();
+        let links = [at(1, 40_000, false), at(2, 9_000, false), at(3, 1_000, true)];
+        assert_eq!(nearest(&links), (near.clone(), Some(said)));
+        assert_eq!(nearest(&links[1..2]), (near.clone(), None), "there is nothing to compare");
+        let silent = [at(1, 40_000, true), at(2, 9_000, true)];
+        assert_eq!(nearest(&silent), (near, None));
     }
 
     #[test]
