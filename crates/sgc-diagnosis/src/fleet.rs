@@ -246,7 +246,7 @@ impl FleetStatus {
                 lines.push(format!("    and {omitted} more").into());
             }
         };
-        let links = report.links.iter().map(|link| self.link_row(link)).collect();
+        let links = report.links.iter().map(|link| self.link_row(report, link)).collect();
         section("Links", &["to", "by", "round trip", "lost", "dialled by"], links, report.links_omitted);
         if !report.not_direct.is_empty() {
             let rows = report.not_direct.iter().map(|peer| vec![peer.name.clone(), peer.reason.to_string()]);
@@ -364,7 +364,7 @@ impl FleetStatus {
     fn links(&self, report: &NodeReport) -> String {
         let named = report.links.iter().take(LINKS_NAMED).map(|link| {
             let round_trip = if link.silent { "silent".to_owned() } else { output::millis(link.rtt_us) };
-            let direct = if self.is_direct(link) { " direct" } else { "" };
+            let direct = if self.is_direct(report, link) { " direct" } else { "" };
             format!("{} {round_trip}{direct}", self.name_of(link))
         });
         let mut named: Vec<_> = named.collect();
@@ -375,10 +375,10 @@ impl FleetStatus {
         if named.is_empty() { "none".to_owned() } else { named.join(", ") }
     }
 
-    fn link_row(&self, link: &ReportLink) -> Vec<String> {
+    fn link_row(&self, report: &NodeReport, link: &ReportLink) -> Vec<String> {
         vec![
             self.name_of(link),
-            if self.is_direct(link) { "itself" } else { "a router" }.to_owned(),
+            if self.is_direct(report, link) { "itself" } else { "a router" }.to_owned(),
             if link.silent { "silent".to_owned() } else { output::millis(link.rtt_us) },
             lost(link),
             if link.dialled { "this node" } else { "the other" }.to_owned(),
@@ -412,9 +412,10 @@ impl FleetStatus {
         self.known.get(id).map(|(name, _)| name.clone())
     }
 
-    /// Returns `true` if a link leads to the node itself and not to a router. Nodes of earlier versions do not tell it.
-    fn is_direct(&self, link: &ReportLink) -> bool {
-        link.direct || !self.is_router(&link.peer)
+    /// Returns `true` if a link of a node leads to the peer itself and not to a router. Only routers listen, so all but the
+    /// direct links of another node lead to them.
+    fn is_direct(&self, report: &NodeReport, link: &ReportLink) -> bool {
+        link.direct || report.is_router && !self.is_router(&link.peer)
     }
 
     /// Returns `true` if a node is known to route for others.
@@ -616,6 +617,7 @@ mod tests {
         let link = |(peer, rtt_us): &(&str, u64)| ReportLink {
             peer: (*peer).into(),
             rtt_us: *rtt_us,
+            direct: *peer != "11",
             ..ReportLink::default()
         };
         let topic = ReportTopic {

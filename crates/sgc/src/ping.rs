@@ -21,8 +21,8 @@ use crate::span::parse_span;
 ///
 /// Your node that runs here asks the other over the mesh, as an observer: enroll your node with `--group observers`. If a
 /// direct link leads to it, each question is asked twice: over that link, then over routers. If there is none, the reason
-/// is shown. The time includes the search for the node's name, and the signatures of question
-/// and answer. Exit code 0 means that an answer came; 1 means that none did.
+/// is shown. The time includes the signatures of question and answer, and often the search for the node's name. Exit code
+/// 0 means that an answer came; 1 means that none did.
 #[derive(Debug, Args)]
 pub(crate) struct PingArgs {
     /// Node to ask

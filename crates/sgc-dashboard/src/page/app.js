@@ -186,8 +186,8 @@ const linksText = (report) => {
 const lostOf = ({ sent_packets, lost_packets }) =>
   sent_packets && lost_packets ? `${((100 * lost_packets) / sent_packets).toFixed(1)} %` : "–";
 
-/** Whether a link leads to the node itself and not to a router; nodes of earlier versions do not tell it. */
-const isDirect = (link) => link.direct || !isRouter(link.peer);
+/** Whether a link leads to the peer itself: only routers listen, so all but the direct links of another node lead to them. */
+const isDirect = (report, link) => link.direct || (report.is_router && !isRouter(link.peer));
 
 /** The path of a topic from its owner. */
 const pathOf = ({ via, direct }) => (!via ? "–" : direct ? "direct" : `over ${nameOfId(via)}`);
@@ -345,8 +345,7 @@ const showMap = () => {
       for (const [name, value] of [["x1", a.x], ["y1", a.y], ["x2", b.x], ["y2", b.y]]) {
         setAttribute(element, name, value.toFixed(1));
       }
-      const passesNoRouter = direct || (!isRouter(from) && !isRouter(to));
-      setAttribute(element, "class", [passesNoRouter && "direct", silent && "silent"].filter(Boolean).join(" "));
+      setAttribute(element, "class", [direct && "direct", silent && "silent"].filter(Boolean).join(" "));
       const state = silent ? "silent" : `${millis(rtt_us)}${lost ? `, ${lost} lost` : ""}`;
       setText(element.firstElementChild, `${a.node.name} – ${b.node.name}: ${state}`);
     },
@@ -509,7 +508,7 @@ const showDetails = () => {
   );
   syncRows(by("links"), report?.links ?? [], (link) => link.peer, [
     { text: nameOf },
-    { text: (link) => (isDirect(link) ? "itself" : "a router") },
+    { text: (link) => (isDirect(report, link) ? "itself" : "a router") },
     { number: true, text: (link) => (link.silent ? "silent" : millis(link.rtt_us)) },
     { number: true, text: lostOf },
     { text: (link) => (link.dialled ? "this node" : "the other") },
