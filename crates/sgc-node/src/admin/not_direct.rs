@@ -34,15 +34,19 @@ pub enum NotDirectReason {
     Blocked,
     /// Packets pass, and no link was made.
     NoLink,
+    /// There is a direct link, and nothing arrives over it.
+    Silent,
     /// There was a direct link, and it ended.
     Lost,
     /// This node has no address that the peer could reach.
     NoAddress,
+    /// One node has IPv4 alone, and the other IPv6 alone.
+    NoCommonFamily,
     /// Too many searches are under way.
     Busy,
     /// `direct` of this node is `"never"`.
     Never,
-    /// `direct` of this node does not permit the peer, or the peer is of another fleet.
+    /// `direct` of this node does not permit the peer.
     NotPermitted,
     /// This node uses nothing of the peer, so the peer looks for a direct path.
     NotWanted,
@@ -56,14 +60,16 @@ pub enum NotDirectReason {
 
 impl NotDirectReason {
     /// All reasons of this version.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 14] = [
         Self::First,
         Self::Unanswered,
         Self::Refused,
         Self::Blocked,
         Self::NoLink,
+        Self::Silent,
         Self::Lost,
         Self::NoAddress,
+        Self::NoCommonFamily,
         Self::Busy,
         Self::Never,
         Self::NotPermitted,
@@ -84,11 +90,13 @@ impl NotDirectReason {
             }
             Self::NoLink => "look into the logs of both nodes",
             Self::NoAddress => "give this host an address that others reach, and name a router by quic://",
+            Self::NoCommonFamily => "give one of the two hosts an address of the other family",
             Self::Never | Self::NotPermitted => {
-                "name the peer in `direct` of [node] here, if it is of this fleet and may learn the addresses of this node"
+                "name the peer, or the partner that it is of, in `direct` of [node] here, if it may learn the addresses of \
+                 this node"
             }
             Self::NotWanted => "`sgc why` at the peer says why there is none",
-            Self::First | Self::Lost | Self::Busy | Self::OnlyRoutes | Self::Other => "",
+            Self::First | Self::Silent | Self::Lost | Self::Busy | Self::OnlyRoutes | Self::Other => "",
         }
     }
 }
@@ -101,8 +109,10 @@ impl From<NoDirectPath> for NotDirectReason {
             NoDirectPath::Refused => Self::Refused,
             NoDirectPath::Blocked => Self::Blocked,
             NoDirectPath::NoLink => Self::NoLink,
+            NoDirectPath::Silent => Self::Silent,
             NoDirectPath::Lost => Self::Lost,
             NoDirectPath::NoAddress => Self::NoAddress,
+            NoDirectPath::NoCommonFamily => Self::NoCommonFamily,
             NoDirectPath::Busy => Self::Busy,
         }
     }
@@ -116,13 +126,13 @@ impl fmt::Display for NotDirectReason {
             Self::Refused => NoDirectPath::Refused.fmt(f),
             Self::Blocked => NoDirectPath::Blocked.fmt(f),
             Self::NoLink => NoDirectPath::NoLink.fmt(f),
+            Self::Silent => NoDirectPath::Silent.fmt(f),
             Self::Lost => NoDirectPath::Lost.fmt(f),
             Self::NoAddress => NoDirectPath::NoAddress.fmt(f),
+            Self::NoCommonFamily => NoDirectPath::NoCommonFamily.fmt(f),
             Self::Busy => NoDirectPath::Busy.fmt(f),
             Self::Never => f.write_str("`direct` of this node is \"never\""),
-            Self::NotPermitted => {
-                f.write_str("`direct` of this node does not permit the peer, or the peer is of another fleet")
-            }
+            Self::NotPermitted => f.write_str("`direct` of this node does not permit the peer"),
             Self::NotWanted => {
                 f.write_str("this node uses nothing of the peer, so the peer looks for a direct path")
             }
