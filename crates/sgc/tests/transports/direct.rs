@@ -9,7 +9,7 @@ use crate::flow::{Flow, LATE};
 use crate::lab::{Carrier, Lab, Nat, RANGES};
 use crate::node::Node;
 use crate::support::{eventually, say};
-use crate::{CALM, Pair, cable, can_run, is_long, turn};
+use crate::{CALM, Pair, cable, can_run, is_long, shared_turn, turn};
 
 /// Number of tries in the long run for each pair of networks, unless `SGC_DIRECT_TRIES` has another.
 const TRIES_LONG: u32 = 200;
@@ -212,7 +212,7 @@ fn router_carries_keep_alives_alone_and_takes_over_when_the_direct_path_dies() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::PortRestricted);
     let (_cloud, pair) = direct_pair(&lab);
     sleep(CALM);
@@ -246,7 +246,7 @@ fn nodes_with_a_direct_link_need_no_router() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::Public);
     let (cloud, pair) = direct_pair(&lab);
     drop(cloud);
@@ -268,7 +268,7 @@ fn one_copy_passes_the_uplink_however_many_direct_links_there_are() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::PortRestricted);
     let (_cloud, pair) = direct_pair(&lab);
     let video = pair.flows.iter().find(|flow| !flow.topic.reliable).unwrap();
@@ -308,7 +308,7 @@ fn node_that_permits_no_direct_link_tells_no_address() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::Public);
     let cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
     let shares = "direct = [\"group:operators\"]\n[ros]\ndomain_id = 0\n\
@@ -331,7 +331,7 @@ fn node_on_the_same_network_does_not_count_for_the_uplink() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::PortRestricted);
     let (_cloud, pair) = direct_pair(&lab);
     let video = pair.flows.iter().find(|flow| !flow.topic.reliable).unwrap();
@@ -356,7 +356,7 @@ fn robot_whose_udp_is_blocked_stays_with_its_router_and_says_why() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::Public);
     lab.block_udp();
     let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
@@ -402,7 +402,7 @@ fn direct_link_follows_a_robot_and_a_desk_that_move() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::PortRestricted);
     lab.add_lte();
     let (_cloud, pair) = direct_pair(&lab);
@@ -433,7 +433,7 @@ fn direct_link_moves_to_a_cable_and_back() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::PortRestricted);
     let (_cloud, pair) = direct_pair(&lab);
     let over_cable = |node: &Node| {
@@ -463,7 +463,7 @@ fn data_goes_directly_while_the_router_restarts() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::PortRestricted);
     let (mut cloud, pair) = direct_pair(&lab);
     let begun = Instant::now();
@@ -491,7 +491,7 @@ fn data_goes_over_the_router_while_the_direct_path_loses_a_fifth() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::PortRestricted);
     let (_cloud, pair) = direct_pair(&lab);
     let begun = Instant::now();

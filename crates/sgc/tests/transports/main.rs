@@ -21,14 +21,13 @@ mod shown;
 #[path = "../support/mod.rs"]
 mod support;
 
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use flow::{Flow, LATE, TOPICS};
 use lab::{Lab, Lan, Nat, RANGES, schemes};
 use node::Node;
-use sgc_sync::lock;
 use sgc_testkit::FakeDomain;
 use sgc_testkit::netsim::{Loss, Profile, TunOptions, on_host};
 use support::{eventually, say};
@@ -40,15 +39,20 @@ const ROUNDS_LONG: usize = 5;
 /// Time before an event from which outages count, because a gap may begin just before the event.
 const JUST_BEFORE: Duration = Duration::from_millis(200);
 
-/// One scenario at a time: each fills the processors.
-static TURN: Mutex<()> = Mutex::new(());
+/// One scenario over all transports at a time, because each fills the processors. Tests with one pair of nodes mostly
+/// wait, so several run together.
+static TURN: RwLock<()> = RwLock::new(());
 
 fn is_long() -> bool {
     std::env::var_os("SGC_TRANSPORTS_LONG").is_some_and(|value| value != "0")
 }
 
-fn turn() -> MutexGuard<'static, ()> {
-    lock(&TURN)
+fn turn() -> RwLockWriteGuard<'static, ()> {
+    TURN.write().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn shared_turn() -> RwLockReadGuard<'static, ()> {
+    TURN.read().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// A robot and a desk that talk by one transport.

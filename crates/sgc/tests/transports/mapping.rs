@@ -10,7 +10,7 @@ use crate::igd::{Igd, OUTSIDE, Speaks};
 use crate::lab::{Lab, Nat, RANGES};
 use crate::node::Node;
 use crate::support::{eventually, say};
-use crate::{Pair, cable, can_run, turn};
+use crate::{Pair, cable, can_run, shared_turn};
 
 fn port_mapping(node: &Node) -> Value {
     node.status()["port_mapping"].clone()
@@ -64,7 +64,7 @@ fn symmetric_nats_are_passed_by_a_mapping_by_pcp_that_is_asked_again_when_the_ga
     if !can_run() || !Igd::is_installed() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     meet_through(Speaks::Pcp(10), "pcp", |igd, robot, port| {
         igd.restart();
         eventually("the mapping is there again", || igd.mapped() == [port]);
@@ -77,7 +77,7 @@ fn gateway_is_asked_only_while_the_configuration_permits_it() {
     if !can_run() || !Igd::is_installed() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(cable(), Nat::RandomPort(RANGES[0]));
     let igd = Igd::start(&lab, Speaks::Pcp(7200));
     let _cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
@@ -118,7 +118,7 @@ fn symmetric_nats_are_passed_by_a_mapping_by_nat_pmp() {
     if !can_run() || !Igd::is_installed() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     meet_through(Speaks::NatPmp, "nat_pmp", |_, _, _| {});
 }
 
@@ -127,6 +127,6 @@ fn symmetric_nats_are_passed_by_a_mapping_by_upnp() {
     if !can_run() || !Igd::is_installed() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     meet_through(Speaks::Upnp, "upnp_igd", |_, _, _| {});
 }

@@ -9,7 +9,7 @@ use sgc_testkit::netsim::Namespace;
 
 use crate::lab::{Lab, Lan, Nat, RANGES, schemes};
 use crate::support::{self, Peer, Running, eventually};
-use crate::{CALM, can_run, is_long, turn};
+use crate::{CALM, can_run, is_long, shared_turn};
 
 /// How many seconds a peer lives at most.
 const PEER_LIFE: &str = "180";
@@ -35,7 +35,7 @@ fn programs_of_others_lose_nothing_when_a_nat_forgets() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let schemes = schemes();
     let schemes = if is_long() { &schemes[..] } else { &schemes[..1] };
     for scheme in schemes {
@@ -94,7 +94,7 @@ fn a_robot_learns_its_nat_from_its_routers() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let second = "10.10.0.2";
     let nats = [(Nat::FullCone, "endpoint_independent"), (Nat::RandomPort(RANGES[0]), "endpoint_dependent")];
     for (nat, mapping) in nats {
@@ -144,7 +144,7 @@ fn node_that_was_killed_has_its_direct_link_again_at_once() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(Lan::Cable, Nat::PortRestricted);
     for (node, router) in [("cloud", true), ("robot", false), ("desk", false)] {
         lab.enroll(node, router);
@@ -182,7 +182,7 @@ fn partners_have_a_direct_link_if_both_name_each_other() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let lab = Lab::new(Lan::Cable, Nat::PortRestricted);
     lab.enroll("cloud", true);
     lab.enroll("robot", false);

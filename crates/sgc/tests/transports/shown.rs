@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use crate::lab::{Lab, Nat, RANGES};
 use crate::node::Node;
 use crate::support::{self, eventually};
-use crate::{Pair, cable, can_run, turn};
+use crate::{Pair, cable, can_run, shared_turn};
 
 const ROBOT: &str = "robot-quic";
 const DESK: &str = "desk-quic";
@@ -52,7 +52,7 @@ fn direct_path_is_shown_with_its_round_trip_and_that_over_the_router() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let mut shown = Shown::start(Nat::PortRestricted);
     eventually("the question goes directly", || shown.ping()["path"]["direct"] == true);
     let answer = shown.ping();
@@ -93,7 +93,7 @@ fn relayed_path_is_shown_with_the_reason_and_the_remedy() {
     if !can_run() {
         return;
     }
-    let _turn = turn();
+    let _turn = shared_turn();
     let shown = Shown::start(Nat::RandomPort(RANGES[0]));
     eventually("it is given up", || shown.ping()["not_direct"]["reason"] == "blocked");
     let answer = shown.ping();
