@@ -30,11 +30,15 @@
 mod allocator;
 mod cast;
 mod clock;
+mod datagrams;
+mod direct;
 mod evil;
 mod ids;
 pub mod mesh;
 mod model;
+mod nat;
 pub mod netsim;
+mod networks;
 mod node;
 mod ports;
 mod record;
@@ -53,10 +57,13 @@ pub use cast::{Member, identity, invited, revocation_list, serial_list};
 pub use clock::Clock;
 pub use ids::{MessageId, NodeKey};
 pub use model::Model;
+pub use nat::{Dependence, Nat, NatKind};
+pub use networks::{NatKey, Networks};
 pub use node::Sharing;
 pub use ports::unused_port;
 pub use record::{
-    CapturedFrame, CapturedPacket, DataDrop, LogEntry, PublishedMessage, ReceivedMessage, What,
+    CapturedFrame, CapturedPacket, DataDrop, LogEntry, PacketCopies, PublishedMessage, ReceivedMessage,
+    SentDatagram, What,
 };
 pub use rng::Dice;
 pub use ros::{FakeClient, FakeDomain, FakeReader, FakeRos, FakeServer, FakeWriter};

@@ -98,6 +98,11 @@ impl Model {
             routed += 1;
             let followers = &self.following[owner];
             named.insert(world.catalogue_name(*owner), (followers.len(), None));
+            if world.nodes[owner.0].is_direct {
+                // Questions come and go.
+                named.insert(world.paths_name(*owner), (world.nodes.len(), None));
+                routed += 1;
+            }
             for topic in world.nodes[owner.0].shares.keys() {
                 let users = &self.granted[&(*owner, topic.clone())];
                 let sinks: BTreeSet<_> =

@@ -1,5 +1,6 @@
 //! The record of a run, for tests to inspect.
 
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use sgc_endpoint::{Event, SinkDrop};
@@ -68,6 +69,30 @@ pub struct CapturedPacket {
     pub at: Duration,
     /// The packet.
     pub packet: Packet,
+}
+
+/// A UDP packet of no link that a node sent.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SentDatagram {
+    /// The sender.
+    pub from: NodeKey,
+    /// The address to which it was sent.
+    pub to: SocketAddr,
+    /// The node that it reached, and the source that this one saw.
+    pub reached: Option<(NodeKey, SocketAddr)>,
+    /// Its content.
+    pub datagram: Vec<u8>,
+}
+
+/// The copies of one packet that a node sent.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PacketCopies {
+    /// Over links that were configured.
+    pub configured: usize,
+    /// Over direct links through the uplink.
+    pub far: usize,
+    /// Over direct links within a network.
+    pub near: usize,
 }
 
 /// An event at a node, with its time.

@@ -1,10 +1,11 @@
 //! Cables between nodes, and wires, the connections over them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use sgc_router::LinkId;
-use sgc_wire::{Control, Name};
+use sgc_wire::{Control, Name, Packet};
 
 use crate::ids::NodeKey;
 
@@ -21,6 +22,8 @@ pub(crate) struct Cable {
     pub(crate) tampers: [Option<Tamper>; 2],
     /// Ends whose packets are lost while their frames arrive, as behind a stalled queue.
     pub(crate) loses: [bool; 2],
+    /// It stands for the path between two hosts. It is whole while a wire is there.
+    pub(crate) is_direct: bool,
 }
 
 impl Cable {
@@ -35,6 +38,28 @@ pub(crate) struct Wire {
     /// The wire still carries frames. It may have stopped before its ends notice.
     pub(crate) carries: bool,
     pub(crate) ends: [WireEnd; 2],
+    /// Set for a connection whose packets pass NATs.
+    pub(crate) path: Option<Path>,
+}
+
+/// The path of a connection through NATs, over UDP.
+pub(crate) struct Path {
+    /// The address to which each side sends.
+    pub(crate) remotes: [SocketAddr; 2],
+    /// The side that dialled. The other one follows its address (RFC 9000, 9).
+    pub(crate) dialer: usize,
+    /// Time since which packets do not pass in both directions.
+    pub(crate) silent_since: Option<Instant>,
+    /// Both nodes know of the silence.
+    pub(crate) is_suspect: bool,
+    /// Reliable content that waits for the path: it is sent again until it arrives.
+    pub(crate) waiting: VecDeque<Content>,
+}
+
+/// The content of a connection, with the side that sends it.
+pub(crate) enum Content {
+    Frame(usize, Control),
+    Packet(usize, Packet),
 }
 
 /// One side of a wire.

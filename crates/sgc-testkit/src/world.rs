@@ -2,35 +2,37 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt::Write as _;
+use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_endpoint::{Event, JoinKind, JoinStatus, PackedType};
 use sgc_router::{LinkClose, LinkId, MappingKind, Neighbour, RouterStats};
-use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
+use sgc_trust::{Identity, TopicSecret, derive_name, name_of, paths_blind};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Consumer, Control, Decode, Encode, JoinBody, LinkStateBody,
-    Metadata, Name, Packet, Qos, RefuseReason, Report, ReportQuestion, Role, RosNode, SinkId, SourceId,
-    SourceOffer,
+    Metadata, Name, NodeId, Packet, Qos, RefuseReason, Report, ReportQuestion, Role, RosNode, SinkId,
+    SourceId, SourceOffer,
 };
 
 use crate::cast::{Member, identity};
 use crate::clock::{Clock, GENESIS};
+use crate::datagrams::Datagrams;
 use crate::ids::{MessageId, NodeKey};
 use crate::node::{Arrival, Directory, Effect, Node, Sharing, metadata};
 use crate::record::{
     CapturedFrame, CapturedPacket, DataDrop, LogEntry, PublishedMessage, ReceivedMessage, What,
 };
 use crate::rng::Dice;
-use crate::wires::{Cable, Wire, WireEnd};
+use crate::wires::{Cable, Content, Wire, WireEnd};
 
 /// Number of deliveries in one call of [`World::run`] above which the network counts as looping.
 const STEPS_MAX: usize = 300_000;
 /// Period in which [`World::run_until`] checks its condition.
 const LOOK: Duration = Duration::from_millis(20);
 /// Silence after which a link seems dead.
-const SUSPECT_AFTER: Duration = Duration::from_millis(2500);
+pub(crate) const SUSPECT_AFTER: Duration = Duration::from_millis(2500);
 /// Bound of the `until_…` methods: longer than a lease and the longest wait between attempts.
 const PATIENCE: Duration = Duration::from_secs(350);
 
@@ -71,7 +73,7 @@ impl WorldConfig {
     }
 }
 
-enum Pending {
+pub(crate) enum Pending {
     Frame {
         wire: usize,
         to: usize,
@@ -93,6 +95,30 @@ enum Pending {
         to: usize,
         suspect: bool,
     },
+    /// An input for this run of a node.
+    Input {
+        node: NodeKey,
+        run: u64,
+        arrival: Arrival,
+    },
+    /// A dial of a direct path, once its packets may have gone there and back.
+    Dial(Dial),
+    /// A look at a connection through NATs.
+    Probe {
+        wire: usize,
+    },
+}
+
+/// A dial of a direct path.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Dial {
+    pub(crate) node: NodeKey,
+    pub(crate) run: u64,
+    pub(crate) peer: NodeId,
+    pub(crate) to: SocketAddr,
+    /// Time until its packets are sent once more, and at which it is given up.
+    pub(crate) again_after: Duration,
+    pub(crate) until: Instant,
 }
 
 /// The detail of a trace. The environment variable `SGC_TRACE` can raise it.
@@ -109,13 +135,14 @@ enum Tracing {
 /// The nodes, the network, and the time.
 pub struct World {
     pub(crate) clock: Clock,
-    config: WorldConfig,
+    pub(crate) config: WorldConfig,
     dice: Dice,
     pub(crate) nodes: Vec<Node>,
     pub(crate) members: Vec<Member>,
     pub(crate) directory: Directory,
     pub(crate) cables: Vec<Cable>,
-    wires: Vec<Wire>,
+    pub(crate) wires: Vec<Wire>,
+    pub(crate) datagrams: Datagrams,
     queue: BTreeMap<(Instant, u64), Pending>,
     queued: u64,
     log: Vec<LogEntry>,
@@ -124,14 +151,14 @@ pub struct World {
     pub(crate) captured: Option<Vec<CapturedFrame>>,
     pub(crate) captured_packets: Vec<CapturedPacket>,
     /// Number of times that each packet crossed each wire in each direction, if it is counted.
-    copies: Option<BTreeMap<WireCrossing, usize>>,
+    pub(crate) copies: Option<BTreeMap<WireCrossing, usize>>,
     trace: Vec<String>,
     tracing: Tracing,
     steps: usize,
 }
 
 /// A packet on a wire: wire, sending side, source, message, fragment, addressee.
-type WireCrossing = (usize, usize, SourceId, u64, u16, Option<SinkId>);
+pub(crate) type WireCrossing = (usize, usize, SourceId, u64, u16, Option<SinkId>);
 
 impl World {
     /// Returns a world of [`WorldConfig::new`].
@@ -150,6 +177,7 @@ impl World {
             directory: Directory::default(),
             cables: Vec::new(),
             wires: Vec::new(),
+            datagrams: Datagrams::default(),
             queue: BTreeMap::new(),
             queued: 0,
             log: Vec::new(),
@@ -207,6 +235,7 @@ impl World {
             frozen: None,
             skew_ms: 0,
             anchors: None,
+            is_direct: false,
         });
         self.members.push(member);
         self.start(key);
@@ -332,6 +361,7 @@ impl World {
             latency,
             tampers: [None, None],
             loses: [false; 2],
+            is_direct: false,
         };
         self.cables.push(cable);
         self.connect(self.cables.len() - 1);
@@ -716,6 +746,12 @@ impl World {
         self.name_of(owner, &Metadata::catalogue(&self.nodes[owner.0].name))
     }
 
+    /// Returns the name at which a node is asked for its addresses.
+    pub fn paths_name(&self, owner: NodeKey) -> Name {
+        let id = self.identity(owner).node_id();
+        name_of(&id, &paths_blind(&id))
+    }
+
     /// Returns the blind of a node's topic, as in its advertisements.
     pub fn blind(&self, owner: NodeKey, topic: &str) -> sgc_wire::Blind {
         let secret = self.identity(owner).fleet_secret().expect("owners hold the fleet secret");
@@ -945,9 +981,9 @@ impl World {
 
     /// Connects a cable that is not cut and whose ends run and are not connected.
     fn connect(&mut self, cable: usize) {
-        let Cable { ends, whole, wire, .. } = &self.cables[cable];
+        let Cable { ends, whole, wire, is_direct, .. } = &self.cables[cable];
         let ends = *ends;
-        if !whole || wire.is_some() || ends.iter().any(|n| !self.is_running(*n)) {
+        if *is_direct || !whole || wire.is_some() || ends.iter().any(|n| !self.is_running(*n)) {
             return;
         }
         let wire = self.wires.len();
@@ -962,7 +998,7 @@ impl World {
             WireEnd { node: ends[side], run, link, up: true, control: instant, data }
         });
         let nodes = [ends[0].node, ends[1].node];
-        self.wires.push(Wire { cable, carries: true, ends });
+        self.wires.push(Wire { cable, carries: true, ends, path: None });
         for (to, node) in nodes.into_iter().enumerate() {
             self.settle(node);
             self.queue(instant, Pending::Quality { wire, to, suspect: false });
@@ -991,21 +1027,23 @@ impl World {
     /// Tells the far end that this end closed, after all frames sent before.
     fn hang_up(&mut self, wire: usize, side: usize, superseded: bool) {
         self.wires[wire].ends[side].up = false;
-        if self.wires[wire].carries {
+        // The peer of a path that is silent learns nothing.
+        if self.wires[wire].carries && self.passes(wire, side) {
             let at = self.arrival(wire, side);
             self.queue(at, Pending::LinkDown { wire, to: 1 - side, superseded });
         }
         self.unplug(wire);
     }
 
-    fn unplug(&mut self, wire: usize) {
+    pub(crate) fn unplug(&mut self, wire: usize) {
         let cable = &mut self.cables[self.wires[wire].cable];
         if cable.wire == Some(wire) {
             cable.wire = None;
+            cable.whole &= !cable.is_direct;
         }
     }
 
-    fn queue(&mut self, at: Instant, pending: Pending) {
+    pub(crate) fn queue(&mut self, at: Instant, pending: Pending) {
         self.queued += 1;
         self.queue.insert((at, self.queued), pending);
     }
@@ -1037,6 +1075,10 @@ impl World {
     }
 
     pub(crate) fn carry_frame(&mut self, wire: usize, side: usize, frame: &Control) {
+        if !self.passes(wire, side) {
+            self.wait_for_path(wire, Content::Frame(side, frame.clone()));
+            return;
+        }
         let ends = &self.wires[wire].ends;
         let (from, to) = (ends[side].node, ends[1 - side].node);
         if let Some(captured) = &mut self.captured {
@@ -1057,7 +1099,12 @@ impl World {
         }
         let cable = &self.cables[self.wires[wire].cable];
         let loses = cable.end_of(self.wires[wire].ends[side].node).is_some_and(|end| cable.loses[end]);
-        if loses || (!packet.header.reliable && self.dice.chance(self.config.loss_percent)) {
+        let passes = self.passes(wire, side);
+        if !passes && packet.header.reliable {
+            self.wait_for_path(wire, Content::Packet(side, packet));
+            return;
+        }
+        if loses || !passes || (!packet.header.reliable && self.dice.chance(self.config.loss_percent)) {
             let (name, ingress) = (packet.header.name, self.wires[wire].ends[side].link);
             let node = self.wires[wire].ends[side].node;
             return self.write_log(node, What::DataDrop { name, ingress, why: DataDrop::Lost });
@@ -1110,6 +1157,9 @@ impl World {
 
     fn deliver(&mut self, pending: Pending) {
         let (wire, to) = match &pending {
+            Pending::Input { .. } | Pending::Dial(_) | Pending::Probe { .. } => {
+                return self.deliver_unlinked(pending);
+            }
             Pending::Frame { wire, to, .. }
             | Pending::Packet { wire, to, .. }
             | Pending::Quality { wire, to, .. }
@@ -1147,11 +1197,27 @@ impl World {
                 self.unplug(wire);
                 Arrival::LinkDown(link, superseded)
             }
+            Pending::Input { .. } | Pending::Dial(_) | Pending::Probe { .. } => return,
         };
         self.arrive(node, arrival);
     }
 
-    fn arrive(&mut self, node: NodeKey, arrival: Arrival) {
+    /// Handles an event that is of no link.
+    fn deliver_unlinked(&mut self, pending: Pending) {
+        match pending {
+            Pending::Input { node, run, arrival } => {
+                let Some(running) = &self.nodes[node.0].running else { return };
+                if running.run == run {
+                    self.arrive(node, arrival);
+                }
+            }
+            Pending::Dial(dial) => self.try_dial(dial),
+            Pending::Probe { wire } => self.probe(wire),
+            _ => {}
+        }
+    }
+
+    pub(crate) fn arrive(&mut self, node: NodeKey, arrival: Arrival) {
         let now = self.now_at(node);
         let Node { running, frozen, .. } = &mut self.nodes[node.0];
         match (frozen, running) {
@@ -1201,6 +1267,17 @@ impl World {
                     self.hang_up(wire, side, superseded);
                 }
             }
+            Effect::HangUp(link) => {
+                let now = self.now_at(node);
+                let Some(running) = &mut self.nodes[node.0].running else { return };
+                if let Some((wire, side)) = running.links.get(&link).copied() {
+                    running.link_down(now, link);
+                    self.hang_up(wire, side, false);
+                }
+            }
+            Effect::Check(to, datagram) => self.send_check(node, to, datagram),
+            Effect::Dial(peer, to) => self.dial(node, peer, to),
+            Effect::Look => self.look_for_addresses(node),
             Effect::Delivered { owner, topic, id, use_number } => {
                 let (at, run) = (self.clock.elapsed(), self.nodes[node.0].runs);
                 self.received.push(ReceivedMessage { id, at, node, run, use_number, owner, topic });

@@ -2,10 +2,13 @@
 //!
 //! The node owns no time and no network: the world passes in arrivals and carries out its [`Effect`]s.
 
+mod direct;
+mod direct_links;
 mod publisher;
 mod publishing;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -22,6 +25,8 @@ use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
     Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
 };
+
+use direct::DirectNode;
 
 use publisher::Publisher;
 
@@ -124,6 +129,8 @@ pub(crate) struct Node {
     pub(crate) skew_ms: i64,
     /// Its trust anchors, revocations included, which survive restarts. `None` stands for those of its identity.
     pub(crate) anchors: Option<Arc<TrustAnchors>>,
+    /// It looks for direct paths.
+    pub(crate) is_direct: bool,
 }
 
 /// An input of a node.
@@ -134,6 +141,12 @@ pub(crate) enum Arrival {
     LinkDown(LinkId, bool),
     /// The driver's measurement of a link.
     Quality(LinkId, Duration, bool),
+    /// A datagram that looks like a check: the addresses at which and from which it came.
+    Check(SocketAddr, SocketAddr, Vec<u8>),
+    /// A router sees this node at an address.
+    Observed(LinkId, SocketAddr),
+    /// The peer of a direct path did not answer when it was dialled.
+    NotDialled(NodeId),
 }
 
 /// An action that the world carries out for a node.
@@ -144,6 +157,14 @@ pub(crate) enum Effect {
     Packet(LinkId, Packet),
     /// Take a link down.
     Close(LinkId, LinkClose),
+    /// Take a link down that nobody uses.
+    HangUp(LinkId),
+    /// Send a check to an address.
+    Check(SocketAddr, Vec<u8>),
+    /// Make a link to a peer at an address.
+    Dial(NodeId, SocketAddr),
+    /// Find out the addresses of this node.
+    Look,
     /// A message was delivered.
     Delivered { owner: NodeKey, topic: String, id: MessageId, use_number: u64 },
     /// Keep its trust anchors over restarts.
@@ -171,6 +192,9 @@ pub(crate) struct Running {
     next_link: u32,
     /// Wire and side of each link that is up.
     pub(crate) links: BTreeMap<LinkId, (usize, usize)>,
+    /// The node at the other end of each of them.
+    neighbours: BTreeMap<LinkId, NodeId>,
+    pub(crate) direct: Option<DirectNode>,
     pub(crate) fib: BTreeMap<Name, FibEntry>,
     pub(crate) sources: BTreeMap<Name, LocalSource>,
     pub(crate) sinks: BTreeMap<Name, LocalSink>,
@@ -240,6 +264,8 @@ impl Node {
             anchors,
             next_link: 1,
             links: BTreeMap::new(),
+            neighbours: BTreeMap::new(),
+            direct: None,
             fib: BTreeMap::new(),
             sources: BTreeMap::new(),
             sinks: BTreeMap::new(),
@@ -253,6 +279,9 @@ impl Node {
             to_router: VecDeque::new(),
             effects: Vec::new(),
         };
+        if self.is_direct {
+            running.begin_direct(now, seed);
+        }
         for (topic, sharing) in &self.shares {
             running.share(now, topic, sharing, directory);
         }
@@ -271,8 +300,25 @@ impl Running {
         let link = LinkId(self.next_link);
         self.next_link += 1;
         self.links.insert(link, (wire, side));
+        self.neighbours.insert(link, peer.node);
         self.router.handle_link_up(now, link, peer);
         link
+    }
+
+    /// Adds a link to a node at a remote address, which is near or not. The search for direct paths knows whether it comes
+    /// of an attempt.
+    pub(crate) fn new_found_link(
+        &mut self,
+        now: Now,
+        wire: usize,
+        side: usize,
+        peer: Neighbour,
+        remote: (SocketAddr, bool),
+    ) -> LinkId {
+        let next = LinkId(self.next_link);
+        let found =
+            self.direct.as_mut().and_then(|direct| direct.link_up(now.instant, next, peer.node, remote));
+        self.new_link(now, wire, side, Neighbour { direct: found, ..peer })
     }
 
     pub(crate) fn set_anchors(&mut self, now: Now, anchors: Arc<TrustAnchors>) {
@@ -303,12 +349,31 @@ impl Running {
                 let quality = LinkQuality { round_trip, is_silent: suspect, ..LinkQuality::default() };
                 self.router.handle_link_quality(now, link, quality);
             }
+            Arrival::Check(to, from, datagram) => {
+                if let Some(direct) = &mut self.direct {
+                    direct.paths.received(now.instant, to, from, &datagram);
+                }
+            }
+            Arrival::Observed(link, address) => {
+                if let Some(direct) = self.direct.as_mut().filter(|_| self.links.contains_key(&link)) {
+                    direct.observe(now.instant, link, address);
+                }
+            }
+            Arrival::NotDialled(peer) => {
+                if let Some(direct) = &mut self.direct {
+                    direct.paths.not_dialled(now.instant, peer);
+                }
+            }
         }
     }
 
     pub(crate) fn link_down(&mut self, now: Now, link: LinkId) {
         if self.links.remove(&link).is_some() {
+            self.neighbours.remove(&link);
             self.router.handle_link_down(now, link);
+            if let Some(direct) = &mut self.direct {
+                direct.link_down(now.instant, link);
+            }
         }
     }
 
@@ -316,6 +381,7 @@ impl Running {
         self.router.handle_timeout(now);
         self.drain_router(now, None);
         self.endpoint.handle_timeout(now);
+        self.direct_timeout(now);
         let due: Vec<_> = self
             .sinks
             .iter()
@@ -439,11 +505,16 @@ impl Running {
 
     /// Drains both machines and the data path. Returns all their effects.
     pub(crate) fn drain(&mut self, now: Now) -> Vec<Effect> {
-        self.drain_endpoint(now);
-        self.drain_router(now, None);
-        while let Some(frame) = self.to_router.pop_front() {
-            self.router.handle_frame(now, LinkId::LOCAL, frame);
+        loop {
+            self.drain_endpoint(now);
             self.drain_router(now, None);
+            while let Some(frame) = self.to_router.pop_front() {
+                self.router.handle_frame(now, LinkId::LOCAL, frame);
+                self.drain_router(now, None);
+            }
+            if !self.drain_direct(now) {
+                break;
+            }
         }
         let mut wake = None;
         self.drain_router(now, Some(&mut wake));
@@ -452,7 +523,8 @@ impl Running {
         }
         let sinks = self.sinks.values().flat_map(|s| [s.retry_at, s.retire_at]).flatten();
         let marks = self.sources.values().filter_map(|s| s.marks.deadline());
-        self.wake = sinks.chain(marks).chain(wake).min();
+        let direct = self.direct.as_mut().map(DirectNode::deadline);
+        self.wake = sinks.chain(marks).chain(wake).chain(direct).min();
         std::mem::take(&mut self.effects)
     }
 
@@ -549,6 +621,17 @@ impl Running {
                 if let Some(owner) = found {
                     self.catalogues.insert(owner, catalogue);
                     self.reconcile(now, owner);
+                }
+            }
+            Event::PathAsked { sink, peer, question } => self.path_asked(now, sink, &peer, &question),
+            Event::PathOffered { peer, offer } => {
+                if let Some(direct) = &mut self.direct {
+                    direct.paths.offered(now.instant, peer, &offer);
+                }
+            }
+            Event::PathRefused { peer, .. } => {
+                if let Some(direct) = &mut self.direct {
+                    direct.paths.refused(now.instant, peer);
                 }
             }
             Event::Recover(recover) => {

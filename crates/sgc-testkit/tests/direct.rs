@@ -1,0 +1,211 @@
+//! Direct paths of whole nodes through simulated NATs.
+
+use std::time::Duration;
+
+use sgc_testkit::{MessageId, NatKind, NodeKey, PacketCopies, Sharing, World, WorldConfig};
+
+const fn ms(n: u64) -> Duration {
+    Duration::from_millis(n)
+}
+
+/// A talker and a listener behind NATs of their own, and a router in the internet.
+struct Pair {
+    world: World,
+    talker: NodeKey,
+    listener: NodeKey,
+    hub: NodeKey,
+    sent: Vec<MessageId>,
+}
+
+fn pair(seed: u64, nats: [Option<NatKind>; 2]) -> Pair {
+    let mut world = World::with(WorldConfig { latency: ms(5)..=ms(20), ..WorldConfig::new(seed) });
+    let hub = world.router("hub");
+    let [talker, listener] = ["talker", "listener"].map(|name| world.proxy(name));
+    for (node, kind) in [talker, listener].into_iter().zip(nats) {
+        world.link_over(hub, node, ms(20));
+        let nat = kind.map(|kind| world.nat(kind, None));
+        world.place(node, nat);
+    }
+    world.share(talker, "/chatter", Sharing::to_fleet());
+    world.use_topic(listener, talker, "/chatter");
+    world.until_granted(listener, talker, "/chatter");
+    Pair { world, talker, listener, hub, sent: Vec::new() }
+}
+
+impl Pair {
+    fn is_direct(&self) -> bool {
+        self.world.is_direct(self.talker, self.listener)
+    }
+
+    /// Publishes every 100 ms for a while.
+    fn publish_for(&mut self, time: Duration) {
+        let end = self.world.elapsed() + time;
+        while self.world.elapsed() < end {
+            self.sent.push(self.world.publish(self.talker, "/chatter"));
+            self.world.run(ms(100));
+        }
+    }
+
+    fn until_direct(&mut self, bound: Duration) {
+        let (talker, listener) = (self.talker, self.listener);
+        let found = self.world.run_until(bound, |world| world.is_direct(talker, listener));
+        assert!(found, "no direct link after {bound:?}\n{}", self.world.trace());
+    }
+
+    /// Returns the node from which the listener gets the data.
+    fn hop(&self) -> Option<NodeKey> {
+        self.world.next_hop(self.listener, &self.world.name(self.talker, "/chatter"))
+    }
+
+    /// Checks that all messages arrived, once and in order.
+    fn assert_whole(&mut self) {
+        self.world.run(ms(3000));
+        let received = self.world.received(self.listener, self.talker, "/chatter");
+        assert_eq!(received, self.sent, "{}", self.world.trace());
+    }
+}
+
+const KINDS: [Option<NatKind>; 7] = [
+    None,
+    Some(NatKind::FULL_CONE),
+    Some(NatKind::ADDRESS_RESTRICTED),
+    Some(NatKind::PORT_RESTRICTED),
+    Some(NatKind::SYMMETRIC),
+    Some(NatKind::FIREWALL),
+    Some(NatKind::UDP_BLOCKED),
+];
+
+#[test]
+fn pairs_meet_as_theory_says_within_a_second_and_lose_nothing() {
+    for (seed, (a, b)) in KINDS.iter().flat_map(|a| KINDS.iter().map(move |b| (*a, *b))).enumerate() {
+        let mut pair = pair(seed as u64, [a, b]);
+        let theory = pair.world.lets_meet(pair.talker, pair.listener, false);
+        pair.publish_for(ms(2000));
+        assert_eq!(pair.is_direct(), theory, "{a:?} and {b:?}\n{}", pair.world.trace());
+        pair.publish_for(ms(8000));
+        let hop = if theory { pair.talker } else { pair.hub };
+        assert_eq!(pair.hop(), Some(hop), "{a:?} and {b:?}");
+        pair.assert_whole();
+    }
+}
+
+#[test]
+fn pair_behind_one_nat_meets_inside_and_stays_together_without_the_router() {
+    let mut pair = pair(1, [None, None]);
+    let (talker, listener, hub) = (pair.talker, pair.listener, pair.hub);
+    let nat = pair.world.nat(NatKind::SYMMETRIC, None);
+    for node in [talker, listener] {
+        pair.world.place(node, Some(nat));
+    }
+    pair.until_direct(Duration::from_secs(30));
+    pair.publish_for(ms(3000));
+    for node in [talker, listener] {
+        pair.world.cut(hub, node);
+    }
+    pair.publish_for(Duration::from_secs(300));
+    assert!(pair.is_direct());
+    pair.assert_whole();
+    pair.world.share(talker, "/new", Sharing::to_fleet());
+    pair.world.use_topic(listener, talker, "/new");
+    pair.world.until_granted(listener, talker, "/new");
+}
+
+#[test]
+fn router_takes_over_while_the_direct_path_is_cut() {
+    let mut pair = pair(2, [Some(NatKind::PORT_RESTRICTED); 2]);
+    let (talker, listener, hub) = (pair.talker, pair.listener, pair.hub);
+    pair.publish_for(Duration::from_secs(70));
+    assert_eq!(pair.hop(), Some(talker));
+    pair.world.cut_direct(talker, listener, true);
+    pair.publish_for(ms(3500));
+    assert_eq!(pair.hop(), Some(hub), "within the time of the keep-alive");
+    pair.publish_for(Duration::from_secs(20));
+    assert!(!pair.world.has_direct(talker, listener));
+    pair.world.cut_direct(talker, listener, false);
+    pair.until_direct(Duration::from_secs(310));
+    pair.publish_for(ms(3000));
+    assert_eq!(pair.hop(), Some(talker));
+    pair.assert_whole();
+}
+
+#[test]
+fn link_survives_or_comes_back_after_nats_forget() {
+    for (seed, kinds) in
+        KINDS[1..4].iter().flat_map(|a| KINDS[1..4].iter().map(move |b| [*a, *b])).enumerate()
+    {
+        for side in 0..2 {
+            let mut pair = pair(seed as u64, kinds);
+            let (talker, listener) = (pair.talker, pair.listener);
+            pair.publish_for(Duration::from_secs(70));
+            assert!(pair.is_direct());
+            let nat = pair.world.nat_of([talker, listener][side]).unwrap();
+            pair.world.forget_mappings(nat);
+            pair.publish_for(Duration::from_secs(30));
+            assert_eq!(
+                (pair.is_direct(), pair.hop()),
+                (true, Some(talker)),
+                "{kinds:?}\n{}",
+                pair.world.trace()
+            );
+            pair.assert_whole();
+        }
+    }
+}
+
+#[test]
+fn node_that_roams_finds_its_peer_again() {
+    let mut pair = pair(3, [Some(NatKind::PORT_RESTRICTED), Some(NatKind::ADDRESS_RESTRICTED)]);
+    pair.publish_for(Duration::from_secs(5));
+    let carrier = pair.world.nat(NatKind::PORT_RESTRICTED, None);
+    for node in [pair.listener, pair.talker] {
+        pair.publish_for(Duration::from_secs(70));
+        assert!(pair.is_direct(), "{}", pair.world.trace());
+        let home = pair.world.nat(NatKind::FULL_CONE, Some(carrier));
+        pair.world.place(node, Some(home));
+        pair.publish_for(Duration::from_secs(15));
+    }
+    // Both are behind one carrier now, which lets no host reach its own address outside.
+    pair.publish_for(Duration::from_secs(20));
+    assert!(!pair.is_direct());
+    pair.assert_whole();
+}
+
+#[test]
+fn camera_with_several_viewers_sends_one_copy_over_its_uplink() {
+    let mut world = World::with(WorldConfig { latency: ms(5)..=ms(20), ..WorldConfig::new(4) });
+    let hub = world.router("hub");
+    let home = world.nat(NatKind::PORT_RESTRICTED, None);
+    let camera = world.proxy("camera");
+    let viewers: Vec<_> = ["one", "two", "near"].iter().map(|name| world.proxy(name)).collect();
+    for (node, behind) in
+        [camera].into_iter().chain(viewers.clone()).zip([Some(home), None, None, Some(home)])
+    {
+        world.link_over(hub, node, ms(20));
+        world.place(node, behind);
+    }
+    world.share(camera, "/image", Sharing::to_fleet());
+    let mut counts = Vec::new();
+    for viewer in viewers.iter().copied() {
+        world.use_topic(viewer, camera, "/image");
+        world.until_granted(viewer, camera, "/image");
+        world.run(Duration::from_secs(10));
+        world.count_copies();
+        world.publish(camera, "/image");
+        world.run(ms(500));
+        let copies = world.packet_copies(camera);
+        assert_eq!(world.copied(), Vec::<String>::new());
+        assert_eq!(copies.len(), 1);
+        counts.extend(copies);
+    }
+    let none = PacketCopies::default();
+    let expected = [
+        PacketCopies { far: 1, ..none },
+        // The router copies.
+        PacketCopies { configured: 1, ..none },
+        PacketCopies { configured: 1, near: 1, ..none },
+    ];
+    assert_eq!(counts, expected);
+    for viewer in viewers {
+        assert!(world.is_direct(camera, viewer), "the links stay");
+    }
+}
