@@ -111,11 +111,11 @@ impl World {
             }
             let copies = packets.entry((*source, *seq, *index)).or_default();
             let remote = path.as_ref().map(|path| path.remotes[*side].ip());
-            *match remote {
-                None => &mut copies.configured,
-                Some(remote) if self.datagrams.networks.is_near(node, remote) => &mut copies.near,
-                Some(_) => &mut copies.far,
-            } += count;
+            match remote {
+                None => copies.configured += count,
+                Some(remote) if self.datagrams.networks.is_near(node, remote) => copies.near += count,
+                Some(_) => copies.far.extend(std::iter::repeat_n(ends[1 - *side].node, *count)),
+            }
         }
         packets.into_values().collect()
     }

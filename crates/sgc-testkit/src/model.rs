@@ -27,7 +27,7 @@ impl Model {
         let alive =
             |n: NodeKey| world.is_running(n) && world.nodes[n.0].frozen.is_none() && world.believes(n, n);
         let reached: BTreeMap<_, _> =
-            world.nodes().filter(|n| alive(*n)).map(|n| (n, reach(world, n, alive))).collect();
+            world.nodes().filter(|n| alive(*n)).map(|n| (n, reach(world, n, alive, true))).collect();
         let mut granted = BTreeMap::new();
         let mut following = BTreeMap::new();
         for (owner, reached) in &reached {
@@ -44,6 +44,12 @@ impl Model {
             following.insert(*owner, followers.copied().collect());
         }
         Self { reached, granted, following }
+    }
+
+    /// Returns `true` if a node reaches another one without direct links.
+    pub fn reaches_over_routers(world: &World, from: NodeKey, to: NodeKey) -> bool {
+        let alive = |n: NodeKey| world.is_running(n) && world.believes(n, n);
+        alive(from) && alive(to) && reach(world, from, alive, false).contains(&to)
     }
 
     /// Returns the nodes that may use a shared topic, whether they want to or not.
@@ -142,14 +148,14 @@ impl Model {
     }
 }
 
-fn reach(world: &World, from: NodeKey, alive: impl Fn(NodeKey) -> bool) -> BTreeSet<NodeKey> {
+fn reach(world: &World, from: NodeKey, alive: impl Fn(NodeKey) -> bool, directly: bool) -> BTreeSet<NodeKey> {
     let mut reached = BTreeSet::from([from]);
     let mut edge = vec![from];
     while let Some(here) = edge.pop() {
         if here != from && !world.nodes[here.0].transit {
             continue;
         }
-        for cable in world.cables.iter().filter(|c| c.whole) {
+        for cable in world.cables.iter().filter(|c| c.whole && (directly || !c.is_direct)) {
             let Some(side) = cable.end_of(here) else { continue };
             let there = cable.ends[1 - side];
             let trust = world.believes(here, there) && world.believes(there, here);

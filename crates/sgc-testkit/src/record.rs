@@ -85,12 +85,12 @@ pub struct SentDatagram {
 }
 
 /// The copies of one packet that a node sent.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct PacketCopies {
     /// Over links that were configured.
     pub configured: usize,
-    /// Over direct links through the uplink.
-    pub far: usize,
+    /// Over direct links through the uplink: the nodes there.
+    pub far: Vec<NodeKey>,
     /// Over direct links within a network.
     pub near: usize,
 }

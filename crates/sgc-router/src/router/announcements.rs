@@ -26,7 +26,10 @@ impl Router {
         let digest = signed_digest(&signed);
         match self.names.recognise(&digest) {
             names::Recognised::New => {}
-            names::Recognised::Known { owner, .. } if !from.is_router && owner != from.node => {
+            // A node that was told an old record tells its owner the newest.
+            names::Recognised::Known { owner, .. }
+                if !from.is_router && owner != from.node && owner != self.config.node =>
+            {
                 return self.drop_frame(link, DropReason::NotOwner { owner });
             }
             names::Recognised::Known { id, .. } => return self.hear(link, cost, id),
