@@ -235,6 +235,20 @@ fn camera_with_several_viewers_sends_one_copy_over_its_uplink() {
     assert_eq!(viewing.publish("/image"), [1, 0, 1]);
 }
 
+/// An advertisement speaks for all names of its owner, also for those that are not told over a link.
+#[test]
+fn topic_of_one_viewer_brings_none_of_several_viewers_to_a_direct_link() {
+    let mut viewing = viewing(5, 2);
+    viewing.world.share(viewing.camera, "/image", Sharing::to_fleet());
+    viewing.world.share(viewing.camera, "/state", Sharing::to_fleet());
+    viewing.world.restart(viewing.camera);
+    viewing.view(0, "/image");
+    viewing.view(1, "/image");
+    viewing.view(1, "/state");
+    assert_eq!(viewing.publish("/image"), [1, 0, 0]);
+    assert_eq!(viewing.publish("/state"), [0, 1, 0]);
+}
+
 #[test]
 fn end_of_a_topic_with_several_viewers_looks_like_no_attack() {
     // The withdrawal overtakes the last advertisement.

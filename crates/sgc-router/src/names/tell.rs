@@ -317,7 +317,14 @@ impl Names {
             for frame in self.records.frames(cx.now, id, cost.min(COST_SUSPECT)) {
                 cx.send(link, frame);
             }
+            // The record speaks for names that are withheld, too.
+            let spoken_for = self.records.live_names(id).into_iter();
+            let is_withheld =
+                |name: &Name| self.withheld.contains(&(link, *name)) && self.interests.contains(link, name);
+            gone.extend(spoken_for.filter(is_withheld));
         }
+        gone.sort_unstable();
+        gone.dedup();
         for names in gone.chunks(NAMES_PER_FRAME_MAX) {
             cx.send(link, Control::Unreach { names: names.to_vec() });
         }
