@@ -261,3 +261,40 @@ fn end_of_a_topic_with_several_viewers_looks_like_no_attack() {
     let drops = viewing.world.router_drops(viewing.camera);
     assert!(!drops.contains(&"not_owner"), "{drops:?}");
 }
+
+#[test]
+fn all_viewers_get_the_camera_directly_while_it_reaches_no_router() {
+    let mut viewing = viewing(7, 2);
+    viewing.world.share(viewing.camera, "/image", Sharing::to_fleet());
+    viewing.view(0, "/image");
+    viewing.view(1, "/image");
+    let (hub, camera) = (viewing.hub, viewing.camera);
+    viewing.world.cut_unseen(hub, camera, ms(9000), ms(9000));
+    viewing.world.run(ms(3500));
+    assert_eq!(viewing.publish("/image")[1], 2, "once the router is silent");
+    viewing.world.run(ms(7000));
+    assert_eq!(viewing.publish("/image"), [0, 2, 0]);
+    viewing.world.rejoin(hub, camera);
+    viewing.world.run(ms(10_000));
+    assert_eq!(viewing.publish("/image"), [1, 0, 0]);
+    let all: Vec<_> = viewing.world.all_published().iter().map(|published| published.id).collect();
+    for viewer in viewing.viewers {
+        let received = viewing.world.received(viewer, camera, "/image");
+        assert_eq!(received[..], all[all.len() - received.len()..]);
+    }
+}
+
+#[test]
+fn viewer_that_reaches_no_router_gets_the_camera_beside_another_copy() {
+    let mut viewing = viewing(8, 2);
+    viewing.world.share(viewing.camera, "/image", Sharing::to_fleet());
+    viewing.view(0, "/image");
+    viewing.view(1, "/image");
+    let (hub, camera, viewer) = (viewing.hub, viewing.camera, viewing.viewers[1]);
+    viewing.world.cut(hub, viewer);
+    viewing.world.run(ms(7000));
+    assert_eq!(viewing.world.granted(camera, "/image"), viewing.viewers);
+    assert_eq!(viewing.publish("/image"), [1, 1, 0]);
+    viewing.world.run(Duration::from_secs(60));
+    assert_eq!(viewing.publish("/image"), [1, 1, 0], "it stays so");
+}

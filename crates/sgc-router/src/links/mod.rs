@@ -77,6 +77,12 @@ impl Links {
         far.map(|(link, state)| (*link, state.node()))
     }
 
+    /// Returns `true` if a router is in reach that can copy what passes the uplink.
+    pub(crate) fn has_copier(&self) -> bool {
+        let copies = |state: &Link| state.direct() != Some(DirectReach::Far) && !state.cost().is_suspect();
+        self.links.values().any(|state| state.is_router() && copies(state))
+    }
+
     /// Returns `true` if what goes over a link passes the uplink.
     pub(crate) fn passes_uplink(&self, link: LinkId) -> bool {
         link != LinkId::LOCAL && self.get(link).is_some_and(|state| state.direct() != Some(DirectReach::Near))

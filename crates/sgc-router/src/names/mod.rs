@@ -14,6 +14,7 @@ mod questions;
 mod record;
 mod records;
 mod tell;
+mod withheld;
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -28,6 +29,7 @@ use self::questions::Questions;
 use self::record::{NewRecord, Record};
 pub(crate) use self::record::{RecordEnd, RecordId, RecordKind};
 use self::records::Records;
+use self::withheld::Withheld;
 use crate::config::RouterConfig;
 use crate::context::Context;
 use crate::drops::DropReason;
@@ -50,7 +52,7 @@ pub(crate) struct Names {
     interests: Interests,
     questions: Questions,
     /// Names of this node that are not told over a direct link, because more than one copy would pass the uplink.
-    withheld: BTreeSet<(LinkId, Name)>,
+    withheld: Withheld,
 }
 
 /// An announcement as its digest tells it.
@@ -107,7 +109,7 @@ impl Names {
             heard: Heard::default(),
             interests: Interests::default(),
             questions: Questions::new(config.incarnation, limits),
-            withheld: BTreeSet::new(),
+            withheld: Withheld::default(),
         }
     }
 
@@ -140,8 +142,13 @@ impl Names {
 
     /// Returns `true` if a link is interested in a name of this node.
     pub(crate) fn wants_own(&self, link: LinkId) -> bool {
+        !self.own_wanted_by(link).is_empty()
+    }
+
+    /// Returns the names of this node in which a link is interested.
+    pub(crate) fn own_wanted_by(&self, link: LinkId) -> Vec<Name> {
         let is_own = |name: &Name| self.owner(name).is_some_and(|owner| owner.node_id == self.own);
-        self.interests.names(link).iter().any(is_own)
+        self.interests.names(link).into_iter().filter(is_own).collect()
     }
 
     /// Returns `true` if routers are told of names that they did not ask for.
@@ -206,7 +213,7 @@ impl Names {
 
     /// Returns the times of the next timeouts.
     pub(crate) fn deadlines(&self) -> impl Iterator<Item = Instant> {
-        self.records.deadlines().chain(self.questions.deadlines())
+        self.records.deadlines().chain(self.questions.deadlines()).chain(self.withheld.deadline())
     }
 
     // ---- Announcements.
@@ -434,7 +441,7 @@ impl Names {
         }
         self.questions.link_down(link);
         self.records.link_down(link);
-        self.withheld.retain(|(other, _)| *other != link);
+        self.withheld.link_down(link);
     }
 
     /// Forgets every route over a link. Returns their names.
@@ -446,6 +453,7 @@ impl Names {
         if !self.interests.remove(link, name) {
             return;
         }
+        self.withheld.forget(link, name);
         self.questions.stop_asking(name);
         let next_hop = |names: &Self| names.next_hop(cx.network, name);
         if !self.transit && next_hop(self).is_none_or(|(link, _)| link != LinkId::LOCAL) {

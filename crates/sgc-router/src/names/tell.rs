@@ -261,14 +261,35 @@ impl Names {
         }
     }
 
-    /// Withholds a name of this node from a direct link, or tells it there again.
-    pub(crate) fn withhold(&mut self, cx: &mut Context<'_>, link: LinkId, name: Name, is_withheld: bool) {
-        let is_news = match is_withheld {
-            true => self.withheld.insert((link, name)),
-            false => self.withheld.remove(&(link, name)),
-        };
-        if is_news {
+    /// Lets the time begin in which the node of a link finds the names among these that it did not want so far.
+    pub(crate) fn begin_interests(&mut self, link: LinkId, names: &[Name]) {
+        for name in names.iter().filter(|name| !self.interests.contains(link, name)) {
+            self.withheld.forget(link, name);
+        }
+    }
+
+    /// Withholds a name of this node from a direct link, or tells it there again. `is_served` says whether the node
+    /// there gets it over another link.
+    pub(crate) fn withhold(
+        &mut self,
+        cx: &mut Context<'_>,
+        link: LinkId,
+        name: Name,
+        (is_withheld, is_served): (bool, bool),
+    ) {
+        if self.withheld.set(cx.now.instant, (link, name), is_withheld, is_served) {
             self.tell_interested(cx, link, &[name]);
+        }
+    }
+
+    /// Tells names after all to nodes that did not find another path to them in time.
+    pub(crate) fn release_withheld(&mut self, cx: &mut Context<'_>) {
+        for (link, name) in self.withheld.release_due(cx.now.instant) {
+            if self.interests.contains(link, &name) {
+                self.tell_interested(cx, link, &[name]);
+            } else {
+                self.withheld.forget(link, &name);
+            }
         }
     }
 
@@ -293,7 +314,7 @@ impl Names {
         let mut gone = Vec::new();
         for name in names {
             let Some(told) = self.interests.told(link, name) else { continue };
-            let is_told = |next_hop| self.may_tell(next_hop, link) && !self.withheld.contains(&(link, *name));
+            let is_told = |next_hop| self.may_tell(next_hop, link) && !self.withheld.contains(link, name);
             let next_hop = self.next_hop(cx.network, name).filter(|(next_hop, _)| is_told(*next_hop));
             let next_hop = next_hop.map(|(next_hop, cost)| (next_hop, cost.saturating_add(of_loss)));
             let id = self.records.id(name);
@@ -320,7 +341,7 @@ impl Names {
             // The record speaks for names that are withheld, too.
             let spoken_for = self.records.live_names(id).into_iter();
             let is_withheld =
-                |name: &Name| self.withheld.contains(&(link, *name)) && self.interests.contains(link, name);
+                |name: &Name| self.withheld.contains(link, name) && self.interests.contains(link, name);
             gone.extend(spoken_for.filter(is_withheld));
         }
         gone.sort_unstable();

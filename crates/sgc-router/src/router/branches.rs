@@ -169,6 +169,15 @@ impl Router {
         }
     }
 
+    /// Does [`Self::spare_uplink`] for all names, after the routers in reach changed.
+    pub(super) fn spare_uplinks(&mut self) {
+        for link in self.links.far().map(|(link, _)| link).collect::<Vec<_>>() {
+            for name in self.names.own_wanted_by(link) {
+                self.spare_uplink_at(link, name);
+            }
+        }
+    }
+
     /// Lets one copy of a name of this node pass the uplink: while other nodes get it through the uplink as well, it is not
     /// told over a direct link, and its sink there joins over a router.
     fn spare_uplink(&mut self, name: Name) {
@@ -183,8 +192,10 @@ impl Router {
         let Some((_, node)) = links.far().find(|(far, _)| *far == link) else { return };
         let is_own = self.names.owner(&name).is_some_and(|owner| owner.node_id == self.config.node);
         let passes = |link| links.passes_uplink(link);
-        let is_withheld = is_own && self.trees.serves_others(&name, link, node, passes);
-        self.names_part(|names, cx| names.withhold(cx, link, name, is_withheld));
+        let is_copied = is_own && links.has_copier();
+        let is_withheld = is_copied && self.trees.serves_others(&name, link, node, passes);
+        let is_served = self.trees.serves_elsewhere(&name, link, node);
+        self.names_part(|names, cx| names.withhold(cx, link, name, (is_withheld, is_served)));
     }
 
     /// Carries out the effects of the trees.

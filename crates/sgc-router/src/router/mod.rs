@@ -121,6 +121,7 @@ impl Router {
         let of_loss = self.links.cost_of_loss(link);
         if let Some(node) = self.links.measure(now.instant, link, quality) {
             self.topology.links_changed(now.instant, &node);
+            self.spare_uplinks();
         }
         if self.links.cost_of_loss(link) != of_loss {
             self.names_part(|names, cx| names.loss_changed(cx, link));
@@ -143,6 +144,7 @@ impl Router {
             Control::Advert { cost, signed } => self.handle_advert(link, cost, signed),
             Control::Unreach { names } => self.handle_unreach(link, &names),
             Control::Interest { names } => {
+                self.names.begin_interests(link, &names);
                 names.iter().for_each(|name| self.spare_uplink_at(link, *name));
                 self.names_part(|part, cx| part.add_interests(cx, link, &names));
             }
@@ -199,6 +201,7 @@ impl Router {
         self.expire_names();
         self.pass_on_late();
         self.take_waiting_lists();
+        self.names_part(Names::release_withheld);
         let effects = self.trees.handle_timeout(now.instant);
         self.perform(effects);
     }

@@ -48,6 +48,7 @@ impl Router {
         self.perform(effects);
         let lost = self.names.lose_link(link);
         self.routes_changed(&lost);
+        self.spare_uplinks();
         if state.hello().is_some() {
             self.topology.links_changed(self.now.instant, state.node());
         }
@@ -66,6 +67,7 @@ impl Router {
                     self.supersede(old, Some(link), alive);
                 }
                 self.tell_all(link);
+                self.spare_uplinks();
                 self.topology.links_changed(self.now.instant, &peer.node);
             }
         }

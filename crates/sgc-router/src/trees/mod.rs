@@ -108,6 +108,12 @@ impl Trees {
         self.trees.get(name).is_some_and(|tree| tree.iter().any(|(_, branch)| serves(branch)))
     }
 
+    /// Returns `true` if data of a name goes over another link than `link` to a sink of `node`.
+    pub(crate) fn serves_elsewhere(&self, name: &Name, link: LinkId, node: &NodeId) -> bool {
+        let mut branches = self.trees.get(name).into_iter().flat_map(|tree| tree.iter());
+        branches.any(|(_, branch)| branch.carries_elsewhere(link, node))
+    }
+
     /// Returns the time of the next timeout.
     pub(crate) fn next_deadline(&self) -> Option<Instant> {
         self.deadlines.first().map(|(at, ..)| *at)

@@ -122,6 +122,11 @@ impl Branch {
         self.role == Role::Subscribe && self.carries() && self.link != link && self.peer != *node
     }
 
+    /// Returns `true` if data goes over it to a sink of `node`, over another link than `link`.
+    pub(super) fn carries_elsewhere(&self, link: LinkId, node: &NodeId) -> bool {
+        self.role == Role::Subscribe && self.carries() && self.link != link && self.peer == *node
+    }
+
     /// Waits for the sink's new request until then.
     pub(super) fn drain(&mut self, until: Instant) {
         self.stage = Stage::Draining { until };

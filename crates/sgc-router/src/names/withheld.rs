@@ -1,0 +1,91 @@
+//! [`Withheld`]: the names of this node that are not told over a direct link, because more than one copy of their data
+//! would pass the uplink.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use sgc_wire::Name;
+
+use crate::link_id::LinkId;
+
+/// Time for a node to join a name over a router. After that, it is told the name over its direct link all the same.
+const FOUND_WITHIN: Duration = Duration::from_secs(5);
+
+/// Whether the node behind a link finds a name without this link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    /// It has until then.
+    Searches { until: Instant },
+    /// It gets the name over another link.
+    IsServed,
+    /// It does not, so it is told the name.
+    FoundNothing,
+}
+
+/// The withheld names.
+#[derive(Debug, Default)]
+pub(super) struct Withheld {
+    names: BTreeMap<(LinkId, Name), State>,
+}
+
+impl Withheld {
+    /// Returns `true` if a name is not told over a link.
+    pub(super) fn contains(&self, link: LinkId, name: &Name) -> bool {
+        self.names.get(&(link, *name)).is_some_and(|state| *state != State::FoundNothing)
+    }
+
+    /// Withholds a name from a link or tells it again. Returns `true` if that changes something for the neighbour.
+    pub(super) fn set(
+        &mut self,
+        now: Instant,
+        key: (LinkId, Name),
+        is_withheld: bool,
+        is_served: bool,
+    ) -> bool {
+        let before = self.contains(key.0, &key.1);
+        match (is_withheld, is_served, self.names.get(&key)) {
+            (false, ..) => {
+                self.names.remove(&key);
+            }
+            (true, true, _) => {
+                self.names.insert(key, State::IsServed);
+            }
+            (true, false, None | Some(State::IsServed)) => {
+                self.names.insert(key, State::Searches { until: now + FOUND_WITHIN });
+            }
+            (true, false, Some(State::Searches { .. } | State::FoundNothing)) => {}
+        }
+        self.contains(key.0, &key.1) != before
+    }
+
+    /// Ends the searches that took too long. Returns their links and names.
+    pub(super) fn release_due(&mut self, now: Instant) -> Vec<(LinkId, Name)> {
+        let mut over = Vec::new();
+        for (key, state) in &mut self.names {
+            if matches!(state, State::Searches { until } if *until <= now) {
+                *state = State::FoundNothing;
+                over.push(*key);
+            }
+        }
+        over
+    }
+
+    /// Forgets that a name was withheld from a link, or told there for want of another path.
+    pub(super) fn forget(&mut self, link: LinkId, name: &Name) {
+        self.names.remove(&(link, *name));
+    }
+
+    /// Returns the time of the next timeout.
+    pub(super) fn deadline(&self) -> Option<Instant> {
+        let until = |state: &State| match state {
+            State::Searches { until } => Some(*until),
+            State::IsServed | State::FoundNothing => None,
+        };
+        self.names.values().filter_map(until).min()
+    }
+
+    /// Forgets a link that is gone.
+    pub(super) fn link_down(&mut self, link: LinkId) {
+        self.names.retain(|(other, _), _| *other != link);
+    }
+}
