@@ -2,6 +2,8 @@
 //!
 //! A seed decides topology and transitions. After each burst of them the network is left alone until it matches
 //! [`Model`], within a bound. Then messages are published and must reach exactly the granted nodes.
+//! In the second test, proxies are behind NATs. Pairs that exchange data have a direct link at rest if and only if theory
+//! allows one, and no source sends a message over a direct link through its uplink beside another copy.
 //! `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and lists failures.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -10,8 +12,8 @@ use std::time::Duration;
 use sgc_endpoint::SinkDrop;
 use sgc_router::{DropReason, MappingKind};
 use sgc_testkit::{
-    DataDrop, Dice, Member, MessageId, Model, NodeKey, Sharing, What, World, WorldConfig, revocation_list,
-    run_seeds,
+    DataDrop, Dice, Member, MessageId, Model, NatKey, NatKind, NodeKey, Sharing, What, World, WorldConfig,
+    revocation_list, run_seeds,
 };
 use sgc_trust::{CertError, OpenError, SignedError};
 
@@ -20,6 +22,11 @@ const COMMITTED: &[u64] = &[
     5, 24, 28, 34, 42, 43, 46, 64, 71, 85, 99, 188, 258, 342, 2048, // showed bugs
     1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 25, 26, 27, 29, 30, 31,
     32, 33, 35, 36, 37, 38, 39, 40,
+];
+/// The same for networks with NATs.
+const COMMITTED_NATS: &[u64] = &[
+    306, 436, 533, 572, 593, 652, // showed bugs
+    1497, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20,
 ];
 /// Longest time from the last transition until all is as it should be: a lease, for what was not believed while a clock
 /// was wrong or not heard of during a partition. All else takes seconds.
@@ -41,7 +48,13 @@ enum Transition {
     Crash(NodeKey),
     CrashUnseen(NodeKey, Duration),
     Cut(NodeKey, NodeKey),
+    /// Packets between two hosts pass only over routers, or directly again.
+    CutPath(NodeKey, NodeKey, bool),
     CutUnseen(NodeKey, NodeKey, Duration, Duration),
+    /// A NAT loses its table.
+    Forget(NatKey),
+    /// A proxy gets an address behind another NAT, or in the internet.
+    Move(NodeKey, Option<NatKey>),
     Publish(NodeKey, &'static str),
     Rejoin(NodeKey, NodeKey),
     Reshare(NodeKey, &'static str, Sharing),
@@ -89,9 +102,112 @@ struct Run {
     /// Set once any clock was changed.
     clocks: bool,
     slowest: Duration,
+    /// Networks with NATs: what is drawn for them, so that the others keep their histories.
+    hosts: Option<Hosts>,
+}
+
+/// The hosts and NATs of a run.
+struct Hosts {
+    dice: Dice,
+    hosts: Vec<NodeKey>,
+    nats: Vec<NatKey>,
+    /// Pairs of hosts whose direct path is cut.
+    cut: BTreeSet<(NodeKey, NodeKey)>,
+    /// Pairs that had no path over routers for a moment.
+    apart: BTreeSet<(NodeKey, NodeKey)>,
+    /// Number of times that a pair was seen with a direct link at rest.
+    met: usize,
+}
+
+impl Hosts {
+    fn draw_nat(&mut self, world: &mut World) -> NatKey {
+        let behind = if self.dice.chance(30) { self.dice.pick(&self.nats) } else { None };
+        let kind = match self.dice.below(12) {
+            0..2 => NatKind::FULL_CONE,
+            2..4 => NatKind::ADDRESS_RESTRICTED,
+            4..7 => NatKind::PORT_RESTRICTED,
+            7..9 => NatKind::SYMMETRIC,
+            9..11 => NatKind::FIREWALL,
+            _ => NatKind::UDP_BLOCKED,
+        };
+        // Addresses behind a firewall are of the internet.
+        let behind = behind.filter(|_| kind.mapping.is_some());
+        let nat = world.nat(if self.dice.chance(30) { kind.hairpinning() } else { kind }, behind);
+        self.nats.push(nat);
+        nat
+    }
+
+    fn draw_place(&mut self, world: &mut World) -> Option<NatKey> {
+        match self.dice.below(10) {
+            0..2 => None,
+            2..5 => self.dice.pick(&self.nats),
+            _ => Some(self.draw_nat(world)),
+        }
+    }
+
+    /// Draws a transition. Returns `None` if it is not possible now.
+    fn draw(&mut self, world: &mut World, shared: &[(NodeKey, &'static str)]) -> Option<Transition> {
+        let (one, other) = (self.dice.pick(&self.hosts)?, self.dice.pick(&self.hosts)?);
+        let cut: Vec<_> = self.cut.iter().copied().collect();
+        Some(match self.dice.below(16) {
+            10..14 => {
+                let (owner, topic) = self.dice.pick(shared).filter(|(owner, _)| *owner != one)?;
+                Transition::Use(one, owner, topic)
+            }
+            14.. => {
+                let (owner, topic) = self.dice.pick(shared).filter(|(owner, _)| world.is_running(*owner))?;
+                Transition::Publish(owner, topic)
+            }
+            0..4 => Transition::Forget(self.dice.pick(&self.nats)?),
+            4..6 => Transition::Move(one, self.draw_place(world)),
+            6..8 if one < other => Transition::CutPath(one, other, true),
+            8..10 => self.dice.pick(&cut).map(|(a, b)| Transition::CutPath(a, b, false))?,
+            _ => return None,
+        })
+    }
 }
 
 impl Run {
+    /// Returns a run in which proxies are behind NATs.
+    fn with_nats(seed: u64) -> Self {
+        let mut run = Self::new(seed);
+        let (world, dice) = (&mut run.world, Dice::new(seed ^ 0x4a75_a2d1));
+        let mut all = Hosts {
+            dice,
+            hosts: Vec::new(),
+            nats: Vec::new(),
+            cut: BTreeSet::new(),
+            apart: BTreeSet::new(),
+            met: 0,
+        };
+        for node in &run.members {
+            if all.dice.chance(90) {
+                let behind = all.draw_place(world);
+                world.place(*node, behind);
+                all.hosts.push(*node);
+            }
+        }
+        world.lose_checks([0, 0, 20][all.dice.below(3)]);
+        for _ in 0..all.dice.within(1..=3) {
+            let (owner, topic) = (all.dice.pick(&run.members), TOPICS[all.dice.below(TOPICS.len())]);
+            let Some(owner) = owner.filter(|owner| !run.shared.contains_key(&(*owner, topic))) else {
+                continue;
+            };
+            run.apply(Transition::Share(
+                owner,
+                topic,
+                Sharing::to_fleet().transient_local(all.dice.below(2)),
+            ));
+            for _ in 0..all.dice.within(1..=3) {
+                if let Some(user) = all.dice.pick(&run.members).filter(|user| *user != owner) {
+                    run.apply(Transition::Use(user, owner, topic));
+                }
+            }
+        }
+        run.hosts = Some(all);
+        run
+    }
+
     fn new(seed: u64) -> Self {
         let mut dice = Dice::new(seed);
         let mut config = WorldConfig::new(dice.number());
@@ -157,11 +273,18 @@ impl Run {
             wrong_clocks: BTreeSet::new(),
             clocks: false,
             slowest: Duration::ZERO,
+            hosts: None,
         }
     }
 
     /// Draws a transition. Returns `None` if it is not possible now.
     fn draw(&mut self) -> Option<Transition> {
+        if let Some(hosts) = &mut self.hosts
+            && hosts.dice.chance(40)
+        {
+            let shared: Vec<_> = self.shared.keys().copied().collect();
+            return hosts.draw(&mut self.world, &shared);
+        }
         let dice = &mut self.dice;
         let world = &self.world;
         let nodes: Vec<_> = world.nodes().collect();
@@ -259,6 +382,18 @@ impl Run {
                 self.cut.insert((a, b));
                 world.cut(a, b);
             }
+            Transition::CutPath(a, b, is_cut) => {
+                if let Some(hosts) = &mut self.hosts {
+                    if is_cut {
+                        hosts.cut.insert((a, b))
+                    } else {
+                        hosts.cut.remove(&(a, b))
+                    };
+                }
+                world.cut_direct(a, b, is_cut);
+            }
+            Transition::Forget(nat) => world.forget_mappings(nat),
+            Transition::Move(n, behind) => world.place(n, behind),
             Transition::CutUnseen(a, b, a_idle, b_idle) => {
                 self.cut.insert((a, b));
                 world.cut_unseen(a, b, a_idle, b_idle);
@@ -287,6 +422,7 @@ impl Run {
             Transition::Wait(time) => self.pass(time),
         }
         self.assert_no_circle();
+        self.note_relays();
     }
 
     fn publish(&mut self, node: NodeKey, topic: &'static str) {
@@ -338,6 +474,7 @@ impl Run {
         while self.world.elapsed() < end {
             self.world.run(ms(100).min(end - self.world.elapsed()));
             self.assert_no_circle();
+            self.note_relays();
         }
     }
 
@@ -362,7 +499,7 @@ impl Run {
         // A change that no node has noticed yet must not pass for a settled state.
         self.pass(IDLE_MAX + ms(500));
         let mut model = Model::from_world(&self.world);
-        while let Err(why) = model.check(&self.world) {
+        while let Err(why) = model.check(&self.world).and_then(|()| self.check_direct(&model)) {
             let waited = self.world.elapsed() - begin;
             assert!(waited < QUIET_MAX, "after {waited:?} of quiet: {why}");
             self.pass(ms(500));
@@ -387,6 +524,7 @@ impl Run {
             }
         }
         self.pass(ms(1500));
+        self.check_uplinks();
         let copied = self.world.copied();
         assert!(copied.is_empty(), "more than one copy over a link: {copied:?}");
         for (id, nodes) in expected {
@@ -403,6 +541,67 @@ impl Run {
         self.check_deliveries();
         self.check_order();
         self.check_log();
+    }
+
+    /// Checks that pairs that exchange data have a direct link if theory allows it, and that no pair has one that it
+    /// forbids.
+    fn check_direct(&mut self, model: &Model) -> Result<(), String> {
+        let Some(hosts) = &mut self.hosts else { return Ok(()) };
+        let world = &self.world;
+        let is_configured = |a, b| {
+            let mut cables = self.cables.iter().filter(|cable| !self.cut.contains(cable));
+            cables.any(|cable| [(a, b), (b, a)].contains(cable))
+        };
+        // A rule for the whole fleet, like `direct = "auto"`, permits no node that may route.
+        let may_route = |node: &NodeKey| self.routers.contains(node);
+        let forbids = |a, b| may_route(a) || may_route(b) || !world.lets_meet(*a, *b, true);
+        let mut met = 0;
+        for ((owner, topic), users) in &model.granted {
+            for user in users.iter().filter(|user| hosts.hosts.contains(user) && hosts.hosts.contains(owner))
+            {
+                let meet = world.lets_meet(*owner, *user, false) && !forbids(owner, user);
+                let is_due = meet && !is_configured(*owner, *user);
+                if is_due && !world.is_direct(*owner, *user) {
+                    let why = world.why_not_direct(*user, *owner);
+                    return Err(format!("{user:?} uses {owner:?}:{topic} without a direct link: {why:?}"));
+                }
+                met += usize::from(is_due);
+            }
+        }
+        for (n, one) in hosts.hosts.iter().enumerate() {
+            for other in &hosts.hosts[..n] {
+                if world.has_direct(*one, *other) && forbids(one, other) {
+                    return Err(format!("{one:?} and {other:?} have a direct link that they must not have"));
+                }
+            }
+        }
+        hosts.met += met;
+        Ok(())
+    }
+
+    /// Notes the pairs that had no path over routers for a moment.
+    fn note_relays(&mut self) {
+        let Some(hosts) = &mut self.hosts else { return };
+        for (n, one) in hosts.hosts.iter().enumerate() {
+            for other in &hosts.hosts[..n] {
+                if !Model::reaches_over_routers(&self.world, *one, *other) {
+                    hosts.apart.extend([(*one, *other), (*other, *one)]);
+                }
+            }
+        }
+    }
+
+    /// Checks that no source sends a message over a direct link through its uplink beside another copy through it, unless
+    /// the node there did not find a path over routers once.
+    fn check_uplinks(&self) {
+        let Some(hosts) = self.hosts.as_ref().filter(|_| !self.clocks) else { return };
+        for node in &self.members {
+            for copies in self.world.packet_copies(*node) {
+                let is_due = |there: &&NodeKey| !hosts.apart.contains(&(*node, **there));
+                let is_alone = (copies.configured, copies.far.len()) == (0, 1);
+                assert!(is_alone || copies.far.iter().find(is_due).is_none(), "{node:?} sends {copies:?}");
+            }
+        }
     }
 
     /// Checks that each subscriber of a transient-local topic has the last messages of its source.
@@ -484,9 +683,9 @@ impl Run {
                 },
                 What::DataDrop { why, .. } => match why {
                     DataDrop::HopLimit | DataDrop::Sink(SinkDrop::Head | SinkDrop::Inconsistent) => false,
-                    // Packets of an earlier run of the owner.
+                    // Packets of an earlier run of the owner, or sealed after this node lost its right.
                     DataDrop::Sink(SinkDrop::Open(why)) => {
-                        matches!(why, OpenError::Forged | OpenError::Epoch { .. })
+                        matches!(why, OpenError::Forged | OpenError::Epoch { .. } | OpenError::NoMac)
                     }
                     _ => true,
                 },
@@ -542,4 +741,21 @@ fn random_networks_become_what_the_model_says() {
         |run| run.world.trace(),
     );
     eprintln!("slowest to become quiet: {:?}", took.into_iter().max().unwrap_or_default());
+}
+
+#[test]
+fn random_networks_with_nats_become_what_the_model_and_theory_say() {
+    let results = run_seeds(
+        COMMITTED_NATS,
+        Run::with_nats,
+        |run| {
+            run.all();
+            (run.slowest, run.hosts.as_ref().map_or(0, |hosts| hosts.met))
+        },
+        |run| run.world.trace(),
+    );
+    let slowest = results.iter().map(|(slowest, _)| *slowest).max().unwrap_or_default();
+    let met: usize = results.iter().map(|(_, met)| met).sum();
+    eprintln!("slowest to become quiet: {slowest:?}; {met} direct links at rest");
+    assert!(met > 0, "no pair met");
 }
