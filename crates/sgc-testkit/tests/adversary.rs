@@ -5,27 +5,39 @@
 //! honest one exists; `docs/explanation/security.md` says how a router can harm nodes behind it. With an honest path,
 //! no honest pair loses its route, its allowance or a reliable message. `SGC_SEEDS=100..2000` runs those seeds instead
 //! of the committed ones and lists failures.
+//!
+//! In the second test all members are behind NATs, and the hostile one lies about addresses, forges and replays checks,
+//! and dials where others are expected. Honest nodes send to addresses that never answered no more than it spent on it,
+//! and make no link with it in the place of another node.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::{IpAddr, SocketAddr};
 use std::rc::Rc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_endpoint::JoinStatus;
+use sgc_endpoint::{Event, JoinStatus};
 use sgc_router::{DropReason, MappingKind};
 use sgc_testkit::{
-    CapturedPacket, Dice, Member, MessageId, NodeKey, Sharing, What, World, WorldConfig, identity,
+    CapturedPacket, Dice, Member, MessageId, NatKind, NodeKey, Sharing, What, World, WorldConfig, identity,
     revocation_list, run_seeds, serial_list,
 };
 use sgc_trust::{CertError, Kem, ReplyKey, SignedError};
 use sgc_wire::{
-    Adjacency, AdvertBody, Blind, Control, JoinBody, LinkStateBody, Name, Recover, RejectReason, Request,
-    SignedBody, SinkId, SourceId,
+    Adjacency, AdvertBody, Blind, CandidateKind, Control, JoinBody, LinkStateBody, Name, PATH_CANDIDATES_MAX,
+    PATH_OFFER_BYTES, PathCandidate, PathOffer, Recover, RejectReason, Request, SignedBody, SinkId, SourceId,
 };
 
 /// Seeds that every run of the tests replays.
 const COMMITTED: &[u64] = &[1, 2, 3, 4, 5, 6, 7, 8];
+/// The same for networks with NATs.
+const COMMITTED_NATS: &[u64] = &[1, 2, 3, 4, 5, 6];
+/// Addresses to which no check may go.
+const BAD: [&str; 5] =
+    ["127.0.0.1:22", "169.254.169.254:80", "224.0.0.251:5353", "255.255.255.255:9", "10.0.0.7:0"];
+/// Longest time until honest pairs have direct links: the longest wait between attempts, and one attempt.
+const DIRECT_MAX: Duration = Duration::from_secs(315);
 /// One-way latency of the adversary's links, more than that of any honest path.
 const SLOW: Duration = Duration::from_millis(450);
 /// Interval of the adversary's actions and of looks at the network.
@@ -83,6 +95,50 @@ enum Hostile {
     Restart,
 }
 
+/// A lie of the hostile member about direct paths.
+#[derive(Clone, Copy, Debug)]
+enum Lie {
+    /// It offers addresses of victims, addresses to which nothing may go, or those of honest members.
+    Victims,
+    Bad,
+    Members,
+    /// Its offers are of another attempt than its questions.
+    OtherAttempts(bool),
+    /// Its checks come from so many addresses of victims each.
+    Forge(usize),
+    /// It sends recorded checks again.
+    Replay,
+    /// It dials where another node is expected.
+    Dial,
+    Nothing,
+}
+
+/// The lies under way.
+#[derive(Default)]
+struct Lies {
+    candidates: Vec<SocketAddr>,
+    other_attempts: bool,
+    forged: usize,
+    victims: u16,
+}
+
+/// The hostile member among hosts behind NATs.
+struct Liar {
+    dice: Dice,
+    node: NodeKey,
+    lies: Rc<RefCell<Lies>>,
+    dials: usize,
+}
+
+/// Returns an address that no host has.
+fn victim(n: u16) -> SocketAddr {
+    SocketAddr::from(([198, 18, (n >> 8) as u8, n as u8], 5353))
+}
+
+fn is_victim(address: SocketAddr) -> bool {
+    matches!(address.ip(), IpAddr::V4(ip) if ip.octets()[..2] == [198, 18])
+}
+
 /// Frames that the adversary keeps back on its links.
 #[derive(Default)]
 struct Hold {
@@ -115,9 +171,44 @@ struct Run {
     /// Number of log entries that were looked at.
     looked_at: usize,
     actions: usize,
+    /// Networks with NATs: what is drawn for them, so that the others keep their histories.
+    liar: Option<Liar>,
 }
 
 impl Run {
+    /// Returns a run in which members are behind NATs.
+    fn with_nats(seed: u64) -> Self {
+        let mut run = Self::new(seed);
+        let mut dice = Dice::new(seed ^ 0x11a7_5eed);
+        let node = run.rogues[1];
+        run.world.record_checks();
+        for host in run.members.iter().copied().chain([run.thief, node]) {
+            let kind = match dice.below(6) {
+                0 => None,
+                1 => Some(NatKind::FULL_CONE),
+                2 => Some(NatKind::ADDRESS_RESTRICTED),
+                3 => Some(NatKind::SYMMETRIC),
+                _ => Some(NatKind::PORT_RESTRICTED),
+            };
+            let nat = kind.map(|kind| run.world.nat(kind, None));
+            run.world.place(host, nat);
+        }
+        let lies = Rc::<RefCell<Lies>>::default();
+        let of_checks = lies.clone();
+        run.world.tamper_checks(node, move |check| {
+            let mut lies = of_checks.borrow_mut();
+            if lies.forged == 0 {
+                return vec![(None, check.to, check.datagram.clone())];
+            }
+            let (from, count) = (lies.victims, lies.forged);
+            lies.victims = from.wrapping_add(count as u16);
+            let copy = |n| (Some(victim(from.wrapping_add(n as u16))), check.to, check.datagram.clone());
+            (0..count).map(copy).collect()
+        });
+        run.liar = Some(Liar { dice, node, lies, dials: 0 });
+        run
+    }
+
     fn new(seed: u64) -> Self {
         let mut dice = Dice::new(seed ^ 0xad5e_75a2);
         let mut config = WorldConfig::new(dice.number());
@@ -200,6 +291,7 @@ impl Run {
             seq: 0,
             looked_at: 0,
             actions: 0,
+            liar: None,
         }
     }
 
@@ -318,8 +410,136 @@ impl Run {
         }
     }
 
+    /// Tells a lie about direct paths.
+    fn lie(&mut self) {
+        let Some(liar) = &mut self.liar else { return };
+        let (world, dice) = (&mut self.world, &mut liar.dice);
+        let lie = match dice.below(10) {
+            0..2 => Lie::Victims,
+            2 => Lie::Bad,
+            3 => Lie::Members,
+            4 => Lie::OtherAttempts(dice.chance(50)),
+            5..7 => Lie::Forge([0, 1, 10][dice.below(3)]),
+            7 => Lie::Replay,
+            8 => Lie::Dial,
+            _ => Lie::Nothing,
+        };
+        world.note(format!("lie: {lie:?}"));
+        self.actions += 1;
+        match lie {
+            Lie::Victims => {
+                let mut lies = liar.lies.borrow_mut();
+                let victims = PATH_CANDIDATES_MAX as u16;
+                lies.victims = lies.victims.wrapping_add(victims);
+                lies.candidates = (0..victims).map(|n| victim(lies.victims.wrapping_sub(n))).collect();
+            }
+            Lie::Bad => {
+                let bad = BAD.map(|text| text.parse().expect("an address"));
+                liar.lies.borrow_mut().candidates = bad.to_vec();
+            }
+            Lie::Members => {
+                let addresses = self.members.iter().filter_map(|member| world.address(*member));
+                liar.lies.borrow_mut().candidates = addresses.take(PATH_CANDIDATES_MAX).collect();
+            }
+            Lie::OtherAttempts(is_on) => liar.lies.borrow_mut().other_attempts = is_on,
+            Lie::Forge(count) => liar.lies.borrow_mut().forged = count,
+            Lie::Replay => {
+                for _ in 0..5 {
+                    let recorded = world.recorded_checks();
+                    let Some(check) = recorded.get(dice.below(recorded.len().max(1))).cloned() else { break };
+                    let from =
+                        [None, Some(victim(dice.below(100) as u16)), check.reached.map(|(_, from)| from)];
+                    world.inject_check(liar.node, from[dice.below(3)], check.to, check.datagram);
+                }
+            }
+            Lie::Dial => {
+                for member in &self.members {
+                    for (from, peer) in world.admitted(*member) {
+                        if peer != liar.node {
+                            let has_link = world.dial_forged(liar.node, from, *member);
+                            assert!(!has_link, "{member:?} takes the liar for {peer:?}");
+                            liar.dials += 1;
+                        }
+                    }
+                }
+            }
+            Lie::Nothing => *liar.lies.borrow_mut() = Lies::default(),
+        }
+        // A restart made it honest.
+        let lies = liar.lies.clone();
+        world.tamper_offers(liar.node, move |offer| {
+            let lies = lies.borrow();
+            let candidate =
+                |address: &SocketAddr| PathCandidate { kind: CandidateKind::Host, place: (*address).into() };
+            let candidates = match lies.candidates.as_slice() {
+                [] => offer.candidates,
+                named => named.iter().map(candidate).collect(),
+            };
+            PathOffer { attempt: offer.attempt ^ u64::from(lies.other_attempts), candidates, ..offer }
+        });
+        world.want_paths(liar.node, &self.members);
+    }
+
+    /// Checks the bytes that honest nodes sent to addresses that never answered. Returns those that victims got.
+    fn check_bytes(&self) -> usize {
+        let Some(liar) = &self.liar else { return 0 };
+        let liar_id = self.world.identity(liar.node).node_id();
+        let checks = self.world.recorded_checks();
+        let mut all_to_victims = 0;
+        for node in &self.members {
+            let offers = |by_liar: bool| {
+                let is_offer = |what: &What| match what {
+                    What::Event(Event::PathOffered { peer, .. }) => !by_liar || *peer == liar_id,
+                    _ => false,
+                };
+                let log = self.world.log().iter().filter(|l| l.node == *node && is_offer(&l.what));
+                log.count() * PATH_OFFER_BYTES
+            };
+            let came = checks.iter().filter_map(|check| Some((check, check.reached?)));
+            let came: Vec<_> = came.filter(|(_, (there, _))| there == node).collect();
+            let bytes = |by_liar: bool| {
+                let by = came.iter().filter(|(check, _)| !by_liar || check.from == liar.node);
+                by.map(|(check, _)| check.datagram.len()).sum::<usize>()
+            };
+            let answered: BTreeSet<_> = came.iter().map(|(_, (_, from))| *from).collect();
+            let sent = || checks.iter().filter(|check| check.from == *node);
+            let sum = |is: &dyn Fn(SocketAddr) -> bool| {
+                sent().filter(|check| is(check.to)).map(|check| check.datagram.len()).sum::<usize>()
+            };
+            let (to_victims, caused) = (sum(&is_victim), offers(true) + bytes(true));
+            assert!(to_victims <= caused, "{node:?} sent victims {to_victims} bytes for {caused}");
+            let (to_silent, caused) = (sum(&|to| !answered.contains(&to)), offers(false) + bytes(false));
+            assert!(to_silent <= caused, "{node:?} sent {to_silent} bytes into silence for {caused}");
+            assert!(!sent().any(|check| BAD.contains(&check.to.to_string().as_str())));
+            all_to_victims += to_victims;
+        }
+        all_to_victims
+    }
+
+    /// Checks that honest pairs that exchange data have direct links in the end.
+    fn check_direct(&mut self) {
+        let uses = &self.uses;
+        let lacks = |world: &World| {
+            let lacks = |(user, owner, _): &&(NodeKey, NodeKey, String)| {
+                world.lets_meet(*user, *owner, false) && !world.is_direct(*user, *owner)
+            };
+            uses.iter().find(lacks).cloned()
+        };
+        self.world.run_until(DIRECT_MAX, |world| lacks(world).is_none());
+        assert_eq!(lacks(&self.world), None, "no direct link");
+    }
+
     /// Returns a link of the adversary that is up. Links that are down are made again now and then.
     fn line(&mut self) -> Option<(NodeKey, NodeKey)> {
+        if let Some(liar) = &mut self.liar
+            && liar.dice.chance(20)
+        {
+            let is_linked = |member: &NodeKey| self.world.is_direct(liar.node, *member);
+            let linked: Vec<_> = self.members.iter().copied().filter(is_linked).collect();
+            if let Some(member) = liar.dice.pick(&linked) {
+                return Some((liar.node, member));
+            }
+        }
         let (rogue, honest) = self.dice.pick(&self.attached)?;
         if self.world.is_linked(rogue, honest) {
             return Some((rogue, honest));
@@ -571,6 +791,9 @@ impl Run {
             if self.dice.chance(60) {
                 self.act();
             }
+            if self.liar.as_mut().is_some_and(|liar| liar.dice.chance(30)) {
+                self.lie();
+            }
             self.besiege();
             self.world.run(TICK.min(end - self.world.elapsed()));
             if strictly {
@@ -694,4 +917,26 @@ fn an_adversary_takes_nothing_from_honest_nodes_with_an_honest_way() {
         |run| run.world.trace(),
     );
     eprintln!("{} hostile actions", actions.iter().sum::<usize>());
+}
+
+#[test]
+fn a_lying_member_makes_nobody_send_more_than_it_did_and_no_link_in_anothers_place() {
+    let results = run_seeds(
+        COMMITTED_NATS,
+        Run::with_nats,
+        |run| {
+            run.all();
+            let to_victims = run.check_bytes();
+            run.check_direct();
+            let refusals = run.members.iter().map(|node| run.world.direct_refusals(*node));
+            let refused = refusals.map(|(withheld, candidates)| withheld + candidates).sum::<u64>();
+            (to_victims, refused, run.liar.as_ref().map_or(0, |liar| liar.dials))
+        },
+        |run| run.world.trace(),
+    );
+    let to_victims: usize = results.iter().map(|(bytes, ..)| bytes).sum();
+    let refused: u64 = results.iter().map(|(_, refused, _)| refused).sum();
+    let dials: usize = results.iter().map(|(.., dials)| dials).sum();
+    eprintln!("{to_victims} bytes to victims, {refused} refusals, {dials} dials");
+    assert!(to_victims > 0 && refused > 0 && dials > 0, "the adversary did nothing");
 }

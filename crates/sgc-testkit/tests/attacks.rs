@@ -1,14 +1,17 @@
 //! Attacks of untrusted nodes inside the network. Each achieves nothing and is counted.
 
+use std::collections::BTreeSet;
+use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_endpoint::{Event, JoinStatus, RefusedBy};
-use sgc_testkit::{CapturedFrame, DataDrop, Member, NodeKey, Sharing, What, World, identity};
+use sgc_testkit::{CapturedFrame, DataDrop, Member, NatKind, NodeKey, Sharing, What, World, identity};
 use sgc_trust::{Identity, Suite};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Class, Control, Decode, JoinBody, NodeId, Packet, PacketHeader,
-    RejectReason, Request, Role, SignedBody, SinkId, SourceId, SourceOffer,
+    AdvertBody, Answer, AnswerBody, CandidateKind, Class, Control, Decode, JoinBody, NodeId,
+    PATH_CANDIDATES_MAX, PATH_OFFER_BYTES, Packet, PacketHeader, PathCandidate, PathOffer, RejectReason,
+    Request, Role, SignedBody, SinkId, SourceId, SourceOffer,
 };
 
 const fn ms(n: u64) -> Duration {
@@ -469,4 +472,191 @@ fn nobody_passes_as_a_node_by_its_name_alone() {
     let ids: [NodeId; 2] = [stranger.node_id(), arm.node_id()];
     assert_ne!(ids[0], ids[1]);
     assert_ne!(stranger.pseudonym(), arm.pseudonym());
+}
+
+/// Addresses that no host of a world has.
+fn victim(n: u16) -> SocketAddr {
+    SocketAddr::from(([198, 18, (n >> 8) as u8, n as u8], 5353))
+}
+
+fn candidate(address: SocketAddr) -> PathCandidate {
+    PathCandidate { kind: CandidateKind::Host, place: address.into() }
+}
+
+/// Two honest members that exchange data, and a lying one, each behind a NAT of its own.
+struct Liar {
+    world: World,
+    honest: [NodeKey; 2],
+    mallory: NodeKey,
+}
+
+fn liar(seed: u64) -> Liar {
+    let mut world = World::new(seed);
+    world.record_checks();
+    let hub = world.router("hub");
+    let [arm, desk, mallory] = ["arm-1", "desk", "mallory"].map(|name| {
+        let node = world.proxy(name);
+        world.link(hub, node);
+        let nat = world.nat(NatKind::PORT_RESTRICTED, None);
+        world.place(node, Some(nat));
+        node
+    });
+    world.share(arm, "/chatter", Sharing::to(&[desk]));
+    world.use_topic(desk, arm, "/chatter");
+    world.until_granted(desk, arm, "/chatter");
+    world.run(ms(3000));
+    assert!(world.is_direct(arm, desk));
+    Liar { world, honest: [arm, desk], mallory }
+}
+
+impl Liar {
+    /// Has the liar look for paths to the honest members for a while, anew after each failure.
+    fn lie_for(&mut self, seconds: u64, lie: impl FnMut(PathOffer) -> PathOffer + Clone + 'static) {
+        for _ in 0..seconds / 15 {
+            self.world.restart(self.mallory);
+            self.world.tamper_offers(self.mallory, lie.clone());
+            self.world.want_paths(self.mallory, &self.honest);
+            self.world.run(ms(15_000));
+        }
+    }
+
+    /// Returns the bytes of checks that an honest node sent to victims.
+    fn bytes_to_victims(&self, node: NodeKey) -> usize {
+        let checks = self.world.recorded_checks().iter();
+        checks.filter(|c| c.from == node && is_victim(c.to)).map(|c| c.datagram.len()).sum()
+    }
+
+    /// Returns the bytes of offers and checks of the liar that reached an honest node.
+    fn bytes_of_liar(&self, node: NodeKey) -> usize {
+        let liar = self.world.identity(self.mallory).node_id();
+        let offered = |l: &&sgc_testkit::LogEntry| {
+            l.node == node && matches!(l.what, What::Event(Event::PathOffered { peer, .. }) if peer == liar)
+        };
+        let checks = self.world.recorded_checks().iter();
+        let from_liar =
+            checks.filter(|c| c.from == self.mallory && c.reached.is_some_and(|(there, _)| there == node));
+        self.world.log().iter().filter(offered).count() * PATH_OFFER_BYTES
+            + from_liar.map(|c| c.datagram.len()).sum::<usize>()
+    }
+
+    /// Checks that the honest members still exchange data directly.
+    fn assert_unharmed(&mut self) {
+        let [arm, desk] = self.honest;
+        assert!(self.world.is_direct(arm, desk), "{}", self.world.trace());
+        let id = self.world.publish(arm, "/chatter");
+        self.world.run(ms(1000));
+        assert_eq!(self.world.received(desk, arm, "/chatter").last(), Some(&id));
+    }
+}
+
+fn is_victim(address: SocketAddr) -> bool {
+    matches!(address.ip(), IpAddr::V4(ip) if ip.octets()[..2] == [198, 18])
+}
+
+#[test]
+fn addresses_of_a_victim_in_offers_cause_no_more_bytes_than_the_offers_have() {
+    let mut scene = liar(30);
+    scene.lie_for(300, |offer| PathOffer {
+        candidates: (0..PATH_CANDIDATES_MAX as u16).map(|n| candidate(victim(n))).collect(),
+        ..offer
+    });
+    for node in scene.honest {
+        let (sent, caused) = (scene.bytes_to_victims(node), scene.bytes_of_liar(node));
+        assert!(sent > 0 && sent <= caused, "{sent} bytes for {caused}");
+        assert!(scene.world.direct_refusals(node).0 > 0, "checks are withheld");
+    }
+    scene.assert_unharmed();
+}
+
+#[test]
+fn checks_from_forged_addresses_cause_no_more_bytes_than_they_have() {
+    let mut scene = liar(31);
+    let mut next = 0_u16;
+    // Each check comes ten times, from ten addresses that are not the liar's.
+    scene.world.tamper_checks(scene.mallory, move |check| {
+        let copy = |n: u16| (Some(victim(next + n)), check.to, check.datagram.clone());
+        let copies = (0..10).map(copy).collect();
+        next = (next + 10) % 50_000;
+        copies
+    });
+    // Behind the hosts' NATs, where the forger's packets pass.
+    for node in scene.honest {
+        scene.world.place(node, None);
+    }
+    scene.lie_for(300, |offer| PathOffer { candidates: Vec::new(), ..offer });
+    for node in scene.honest {
+        let (sent, caused) = (scene.bytes_to_victims(node), scene.bytes_of_liar(node));
+        assert!(sent > 0 && sent <= caused, "{sent} bytes for {caused}");
+        let checks = scene.world.recorded_checks().iter().filter(|c| c.from == node && is_victim(c.to));
+        let victims: BTreeSet<_> = checks.map(|c| c.to).collect();
+        assert!(victims.len() > 1);
+    }
+    scene.assert_unharmed();
+}
+
+#[test]
+fn addresses_of_this_host_and_its_segment_get_no_check() {
+    let mut scene = liar(32);
+    let bad = ["127.0.0.1:22", "169.254.169.254:80", "224.0.0.251:5353", "255.255.255.255:9", "10.0.0.7:0"];
+    let bad = bad.map(|text| text.parse::<SocketAddr>().expect("an address"));
+    scene.lie_for(60, move |offer| PathOffer { candidates: bad.map(candidate).to_vec(), ..offer });
+    assert!(!scene.world.recorded_checks().iter().any(|check| bad.contains(&check.to)));
+    for node in scene.honest {
+        assert!(scene.world.direct_refusals(node).1 >= bad.len() as u64);
+    }
+    scene.assert_unharmed();
+}
+
+#[test]
+fn answers_of_other_attempts_cause_few_questions() {
+    let mut scene = liar(33);
+    let liar = scene.world.identity(scene.mallory).node_id();
+    let mut number = 0;
+    scene.lie_for(300, move |offer| {
+        number += 1;
+        PathOffer { attempt: number, ..offer }
+    });
+    for node in scene.honest {
+        let offers = scene.world.log().iter().filter(
+            |l| matches!(l.what, What::Event(Event::PathOffered { peer, .. }) if l.node == node && peer == liar),
+        );
+        // Two in each attempt of the liar, which may begin four in ten seconds.
+        let offers = offers.count();
+        assert!((1..=2 * 4 * 30).contains(&offers), "{offers} offers in 300 s");
+    }
+    scene.assert_unharmed();
+}
+
+#[test]
+fn checks_that_are_sent_again_after_the_attempt_get_no_answer() {
+    let mut scene = liar(34);
+    let recorded = scene.world.recorded_checks().to_vec();
+    assert!(recorded.iter().any(|check| check.reached.is_some()));
+    for check in &recorded {
+        let from = [None, Some(victim(1)), check.reached.map(|(_, from)| from)];
+        for from in from {
+            scene.world.inject_check(scene.mallory, from, check.to, check.datagram.clone());
+        }
+    }
+    let before = scene.world.recorded_checks().len();
+    scene.world.run(ms(10_000));
+    assert_eq!(scene.world.recorded_checks()[before..], [], "no node answers");
+    scene.assert_unharmed();
+}
+
+#[test]
+fn another_node_at_the_admitted_address_gets_no_link() {
+    let mut scene = liar(35);
+    let mut tried = 0;
+    for node in scene.honest {
+        for (from, peer) in scene.world.admitted(node) {
+            assert!(scene.honest.contains(&peer));
+            assert!(!scene.world.dial_forged(scene.mallory, from, node));
+            tried += 1;
+        }
+        // The peer itself gets one there, which is no crime.
+        assert!(!scene.world.has_direct(scene.mallory, node));
+    }
+    assert!(tried > 0);
+    scene.assert_unharmed();
 }
