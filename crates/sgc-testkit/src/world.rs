@@ -1036,10 +1036,20 @@ impl World {
     }
 
     pub(crate) fn unplug(&mut self, wire: usize) {
-        let cable = &mut self.cables[self.wires[wire].cable];
-        if cable.wire == Some(wire) {
-            cable.wire = None;
-            cable.whole &= !cable.is_direct;
+        let cable = self.wires[wire].cable;
+        if self.cables[cable].wire == Some(wire) {
+            // Two hosts may have several links.
+            let is_other = |(other, known): &(usize, &Wire)| {
+                *other != wire
+                    && known.cable == cable
+                    && known.carries
+                    && known.path.is_some()
+                    && known.ends.iter().any(|end| end.up)
+            };
+            let other = self.wires.iter().enumerate().filter(is_other).next_back().map(|(other, _)| other);
+            let cable = &mut self.cables[cable];
+            cable.wire = other;
+            cable.whole &= !cable.is_direct || other.is_some();
         }
     }
 
@@ -1301,7 +1311,7 @@ fn frame_text(frame: &Control) -> String {
             Ok(AdvertBody { seq, withdraw, blinds, .. }) => {
                 let kind = if withdraw { "Withdrawal" } else { "Advert" };
                 let blinds: Vec<_> = blinds.iter().map(|b| b.short()).collect();
-                format!("{kind} at {cost} of {}: {}", seq - GENESIS.0, blinds.join(" "))
+                format!("{kind} at {cost} of {}: {}", seq.wrapping_sub(GENESIS.0), blinds.join(" "))
             }
             Err(_) => "malformed Advert".to_owned(),
         },
@@ -1321,7 +1331,12 @@ fn frame_text(frame: &Control) -> String {
                 let routers: Vec<_> =
                     routers.iter().map(|a| format!("{}:{}", a.node.short(), a.cost)).collect();
                 let attached: Vec<_> = attached.iter().map(|t| t.short()).collect();
-                format!("LinkState {}: {} + {}", seq - GENESIS.0, routers.join(" "), attached.join(" "))
+                format!(
+                    "LinkState {}: {} + {}",
+                    seq.wrapping_sub(GENESIS.0),
+                    routers.join(" "),
+                    attached.join(" ")
+                )
             }
             Err(_) => "malformed LinkState".to_owned(),
         },

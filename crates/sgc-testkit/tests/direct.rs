@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use sgc_testkit::{MessageId, NatKind, NodeKey, PacketCopies, Sharing, World, WorldConfig};
+use sgc_wire::Control;
 
 const fn ms(n: u64) -> Duration {
     Duration::from_millis(n)
@@ -297,4 +298,22 @@ fn viewer_that_reaches_no_router_gets_the_camera_beside_another_copy() {
     assert_eq!(viewing.publish("/image"), [1, 1, 0]);
     viewing.world.run(Duration::from_secs(60));
     assert_eq!(viewing.publish("/image"), [1, 1, 0], "it stays so");
+}
+
+#[test]
+fn viewers_that_come_at_one_time_settle_at_once() {
+    let mut viewing = viewing(9, 2);
+    viewing.world.share(viewing.camera, "/state", Sharing::to_fleet());
+    viewing.view(0, "/state");
+    viewing.view(1, "/state");
+    viewing.world.share(viewing.camera, "/image", Sharing::to_fleet());
+    viewing.world.capture();
+    for viewer in viewing.viewers.clone() {
+        viewing.world.use_topic(viewer, viewing.camera, "/image");
+    }
+    viewing.world.run(Duration::from_secs(10));
+    assert_eq!(viewing.publish("/image"), [1, 0, 0]);
+    let to_camera = viewing.world.captured().iter().filter(|frame| frame.to == viewing.camera);
+    let joins = to_camera.filter(|captured| matches!(captured.frame, Control::Join { .. })).count();
+    assert!(joins <= 12, "{joins} requests");
 }

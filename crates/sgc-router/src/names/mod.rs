@@ -29,6 +29,7 @@ use self::questions::Questions;
 use self::record::{NewRecord, Record};
 pub(crate) use self::record::{RecordEnd, RecordId, RecordKind};
 use self::records::Records;
+pub(crate) use self::withheld::Demand;
 use self::withheld::Withheld;
 use crate::config::RouterConfig;
 use crate::context::Context;

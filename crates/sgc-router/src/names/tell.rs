@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use sgc_wire::{Control, NAMES_PER_FRAME_MAX, Name, NodeId, Now};
 
-use super::{Names, RecordId};
+use super::{Demand, Names, RecordId};
 use crate::context::Context;
 use crate::drops::DropReason;
 use crate::lease::verifies_elsewhere;
@@ -268,16 +268,9 @@ impl Names {
         }
     }
 
-    /// Withholds a name of this node from a direct link, or tells it there again. `is_served` says whether the node
-    /// there gets it over another link.
-    pub(crate) fn withhold(
-        &mut self,
-        cx: &mut Context<'_>,
-        link: LinkId,
-        name: Name,
-        (is_withheld, is_served): (bool, bool),
-    ) {
-        if self.withheld.set(cx.now.instant, (link, name), is_withheld, is_served) {
+    /// Withholds a name of this node from a direct link, or tells it there again.
+    pub(crate) fn withhold(&mut self, cx: &mut Context<'_>, link: LinkId, name: Name, demand: Demand) {
+        if self.withheld.set(cx.now.instant, (link, name), demand) {
             self.tell_interested(cx, link, &[name]);
         }
     }

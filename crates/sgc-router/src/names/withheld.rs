@@ -22,6 +22,17 @@ enum State {
     FoundNothing,
 }
 
+/// The nodes that get a name, for one direct link.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Demand {
+    /// A router is in reach that can make copies.
+    pub(crate) is_copied: bool,
+    /// Other nodes than that of the link get the name through the uplink, over other links.
+    pub(crate) others: bool,
+    /// The node of the link gets it over another link.
+    pub(crate) is_served: bool,
+}
+
 /// The withheld names.
 #[derive(Debug, Default)]
 pub(super) struct Withheld {
@@ -35,26 +46,22 @@ impl Withheld {
     }
 
     /// Withholds a name from a link or tells it again. Returns `true` if that changes something for the neighbour.
-    pub(super) fn set(
-        &mut self,
-        now: Instant,
-        key: (LinkId, Name),
-        is_withheld: bool,
-        is_served: bool,
-    ) -> bool {
+    pub(super) fn set(&mut self, now: Instant, key: (LinkId, Name), demand: Demand) -> bool {
         let before = self.contains(key.0, &key.1);
-        match (is_withheld, is_served, self.names.get(&key)) {
-            (false, ..) => {
-                self.names.remove(&key);
-            }
-            (true, true, _) => {
-                self.names.insert(key, State::IsServed);
-            }
-            (true, false, None | Some(State::IsServed)) => {
-                self.names.insert(key, State::Searches { until: now + FOUND_WITHIN });
-            }
-            (true, false, Some(State::Searches { .. } | State::FoundNothing)) => {}
-        }
+        let state = self.names.get(&key).copied();
+        let state = match demand {
+            Demand { is_copied: false, .. } => None,
+            Demand { others: true, is_served: true, .. } => Some(State::IsServed),
+            Demand { others: false, is_served: true, .. } => None,
+            // If two nodes leave for a router at one time, each misses the other's branch for a moment.
+            Demand { .. } if matches!(state, Some(State::Searches { .. } | State::FoundNothing)) => state,
+            Demand { others: true, .. } => Some(State::Searches { until: now + FOUND_WITHIN }),
+            Demand { others: false, .. } => None,
+        };
+        match state {
+            Some(state) => self.names.insert(key, state),
+            None => self.names.remove(&key),
+        };
         self.contains(key.0, &key.1) != before
     }
 

@@ -8,6 +8,7 @@ use sgc_wire::{
 use super::Router;
 use crate::drops::DropReason;
 use crate::link_id::LinkId;
+use crate::names::Demand;
 use crate::output::Output;
 use crate::trees::{Effect, Effects, NewBranch, Place};
 
@@ -192,10 +193,12 @@ impl Router {
         let Some((_, node)) = links.far().find(|(far, _)| *far == link) else { return };
         let is_own = self.names.owner(&name).is_some_and(|owner| owner.node_id == self.config.node);
         let passes = |link| links.passes_uplink(link);
-        let is_copied = is_own && links.has_copier();
-        let is_withheld = is_copied && self.trees.serves_others(&name, link, node, passes);
-        let is_served = self.trees.serves_elsewhere(&name, link, node);
-        self.names_part(|names, cx| names.withhold(cx, link, name, (is_withheld, is_served)));
+        let demand = Demand {
+            is_copied: is_own && links.has_copier(),
+            others: self.trees.serves_others(&name, link, node, passes),
+            is_served: self.trees.serves_elsewhere(&name, link, node),
+        };
+        self.names_part(|names, cx| names.withhold(cx, link, name, demand));
     }
 
     /// Carries out the effects of the trees.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng as _;
-use sgc_router::{DirectReach, LinkId};
+use sgc_router::{DirectReach, LinkId, Router};
 use sgc_session::{DirectPaths, LocalAddress};
 use sgc_trust::{Grantees, VerifiedPeer};
 use sgc_wire::{
@@ -24,10 +24,14 @@ const REFLEXIVE_MAX: usize = 3;
 /// As in `sgc-node`: time after which a direct link is closed over which neither node wants data.
 const UNUSED_MAX: Duration = Duration::from_secs(120);
 
+/// As in `sgc-node`: time after which one is closed that has a better one beside it.
+const SUPERSEDED_MAX: Duration = Duration::from_secs(10);
+
 /// A direct link that is up.
 #[derive(Debug)]
 struct DirectLink {
     peer: NodeId,
+    is_silent: bool,
     unused: Option<Instant>,
 }
 
@@ -37,8 +41,9 @@ pub(crate) struct DirectNode {
     links: BTreeMap<LinkId, DirectLink>,
     pub(super) permitted: Grantees,
     pub(super) host: Option<SocketAddr>,
-    /// Addresses from which routers see this node come, by link.
+    /// Addresses from which routers see this node come, by link, and those that were known last.
     observed: BTreeMap<LinkId, SocketAddr>,
+    reflexive: BTreeSet<SocketAddr>,
     /// The nodes whose links are accepted, by the addresses from which they may come.
     pub(crate) expected: BTreeMap<SocketAddr, NodeId>,
     pub(super) look_at: Instant,
@@ -55,6 +60,7 @@ impl DirectNode {
             permitted: Grantees { fleets: [own.ca].into(), ..Grantees::default() },
             host: None,
             observed: BTreeMap::new(),
+            reflexive: BTreeSet::new(),
             expected: BTreeMap::new(),
             look_at: now,
             tamper: None,
@@ -82,16 +88,19 @@ impl DirectNode {
 
     /// Takes the address at which a router sees this node.
     pub(crate) fn observe(&mut self, now: Instant, link: LinkId, address: SocketAddr) {
-        if self.observed.insert(link, address) != Some(address) {
+        self.observed.insert(link, address);
+        let reflexive = self.observed.values().copied().collect();
+        if self.reflexive != reflexive {
+            self.reflexive = reflexive;
             self.addresses_changed(now);
         }
     }
 
     fn addresses_changed(&mut self, now: Instant) {
         let Some(base) = self.host else { return };
-        let seen: BTreeSet<_> = self.observed.values().copied().filter(|seen| *seen != base).collect();
+        let seen = self.reflexive.iter().copied().filter(|seen| *seen != base);
         let kind = CandidateKind::ServerReflexive;
-        let reflexive = seen.into_iter().map(|address| LocalAddress { kind, address, base });
+        let reflexive = seen.map(|address| LocalAddress { kind, address, base });
         let host = LocalAddress { kind: CandidateKind::Host, address: base, base };
         let local = reflexive.take(REFLEXIVE_MAX).chain([host]).take(PATH_CANDIDATES_MAX);
         self.paths.set_local(now, local.collect());
@@ -111,7 +120,7 @@ impl DirectNode {
         if !is_direct {
             return None;
         }
-        self.links.insert(link, DirectLink { peer, unused: None });
+        self.links.insert(link, DirectLink { peer, is_silent: false, unused: None });
         self.paths.linked(now, peer);
         Some(if is_near { DirectReach::Near } else { DirectReach::Far })
     }
@@ -122,7 +131,23 @@ impl DirectNode {
         let Some(DirectLink { peer, .. }) = self.links.remove(&link) else { return };
         if self.links.values().all(|other| other.peer != peer) {
             self.paths.ended(now, peer);
+        } else {
+            self.silence_changed(now, peer);
         }
+    }
+
+    /// Notes whether nothing arrives over a link.
+    pub(super) fn link_looked_at(&mut self, now: Instant, link: LinkId, is_silent: bool) {
+        let Some(direct) = self.links.get_mut(&link) else { return };
+        if std::mem::replace(&mut direct.is_silent, is_silent) != is_silent {
+            let peer = direct.peer;
+            self.silence_changed(now, peer);
+        }
+    }
+
+    fn silence_changed(&mut self, now: Instant, peer: NodeId) {
+        let is_silent = self.links.values().filter(|link| link.peer == peer).all(|link| link.is_silent);
+        self.paths.silent(now, peer, is_silent);
     }
 
     /// Answers a peer that asks for the addresses of this node.
@@ -146,12 +171,14 @@ impl DirectNode {
     }
 
     /// Returns the direct links that nothing has used for a while.
-    pub(super) fn unused(&mut self, now: Instant, is_used: impl Fn(LinkId) -> bool) -> Vec<LinkId> {
+    pub(super) fn unused(&mut self, now: Instant, router: &Router) -> Vec<LinkId> {
         let mut over = Vec::new();
         for (link, direct) in &mut self.links {
-            let is_used = is_used(*link) || self.paths.is_wanted(&direct.peer);
+            let is_superseded = router.is_superseded(*link);
+            let is_used = !is_superseded && (self.paths.is_wanted(&direct.peer) || router.is_used(*link));
+            let unused_max = if is_superseded { SUPERSEDED_MAX } else { UNUSED_MAX };
             direct.unused = if is_used { None } else { direct.unused.or(Some(now)) };
-            if direct.unused.is_some_and(|since| now.saturating_duration_since(since) >= UNUSED_MAX) {
+            if direct.unused.is_some_and(|since| now.saturating_duration_since(since) >= unused_max) {
                 over.push(*link);
             }
         }

@@ -42,8 +42,7 @@ impl Running {
         let permitted = owners.filter(|owner| direct.permitted.find(owner).is_some());
         let wanted = permitted.map(|owner| owner.node_id).chain(direct.forced.iter().copied()).collect();
         direct.paths.want(now.instant, &wanted);
-        let router = &self.router;
-        for link in direct.unused(now.instant, |link| router.is_used(link)) {
+        for link in direct.unused(now.instant, &self.router) {
             self.effects.push(Effect::HangUp(link));
         }
     }

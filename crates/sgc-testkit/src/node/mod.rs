@@ -348,6 +348,9 @@ impl Running {
             Arrival::Quality(link, round_trip, suspect) => {
                 let quality = LinkQuality { round_trip, is_silent: suspect, ..LinkQuality::default() };
                 self.router.handle_link_quality(now, link, quality);
+                if let Some(direct) = &mut self.direct {
+                    direct.link_looked_at(now.instant, link, suspect);
+                }
             }
             Arrival::Check(to, from, datagram) => {
                 if let Some(direct) = &mut self.direct {
