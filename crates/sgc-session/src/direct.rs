@@ -153,6 +153,16 @@ impl Peer {
         }
     }
 
+    /// Returns `true` if an attempt may follow one that the peer began, and counts it.
+    fn may_begin_anew(&mut self, now: Instant) -> bool {
+        self.asked.retain(|at| now.saturating_duration_since(*at) < ASKED_WITHIN);
+        let may = self.asked.len() < ASKED_MAX;
+        if may {
+            self.asked.push_back(now);
+        }
+        may
+    }
+
     fn is_idle(&self) -> bool {
         !self.is_of_use() && self.attempt.is_none()
     }
@@ -249,11 +259,9 @@ impl DirectPaths {
         {
             return Some(attempt.offer());
         }
-        peer.asked.retain(|at| now.saturating_duration_since(*at) < ASKED_WITHIN);
-        if peer.asked.len() >= ASKED_MAX || (is_new && under_way >= DIRECT_ATTEMPTS_MAX) {
+        if (is_new && under_way >= DIRECT_ATTEMPTS_MAX) || !peer.may_begin_anew(now) {
             return None;
         }
-        peer.asked.push_back(now);
         self.begin(now, node);
         let attempt = self.peers.get_mut(&node)?.attempt.as_mut()?;
         attempt.is_with(question.attempt).then(|| attempt.offer())
@@ -265,7 +273,10 @@ impl DirectPaths {
         let Some(attempt) = &mut peer.attempt else { return };
         self.outputs.push_back(DirectOutput::Leave { peer: node });
         if !attempt.take_offer(now, offer, &mut self.refused_candidates) {
-            // The peer began anew in between.
+            // The peer began anew in between. Two that do so at one time could follow each other without end.
+            if !peer.may_begin_anew(now) {
+                return self.fail(now, node, NoDirectPath::Unanswered);
+            }
             self.begin(now, node);
         } else if !attempt.shares_family(offer) {
             return self.fail(now, node, NoDirectPath::NoCommonFamily);
