@@ -1046,7 +1046,7 @@ impl World {
                     && known.path.is_some()
                     && known.ends.iter().any(|end| end.up)
             };
-            let other = self.wires.iter().enumerate().filter(is_other).next_back().map(|(other, _)| other);
+            let other = self.wires.iter().enumerate().rfind(is_other).map(|(other, _)| other);
             let cable = &mut self.cables[cable];
             cable.wire = other;
             cable.whole &= !cable.is_direct || other.is_some();
