@@ -434,8 +434,8 @@ mod tests {
             "Port mapping: the gateway 192.168.1.1 is being asked."
         );
         assert_eq!(
-            said(json!({ "state": "off", "why_off": "no router over QUIC sees a NAT" })).unwrap(),
-            "Port mapping: off, because no router over QUIC sees a NAT."
+            said(json!({ "state": "off", "why_off": "no router over QUIC or DTLS sees a NAT" })).unwrap(),
+            "Port mapping: off, because no router over QUIC or DTLS sees a NAT."
         );
         assert_eq!(said(json!({})), None);
     }

@@ -272,6 +272,11 @@ pub(crate) const CONTROL: &[Refusal] = &[
         "is the node busy, or under attack?",
     ),
     counted(
+        NodeDrop::DtlsOverflowed.key(),
+        "more datagrams of a DTLS link arrived than could be handled; QUIC sends their content again",
+        "is the node busy?",
+    ),
+    counted(
         OperationRefusal::Stale.key(),
         "an operator's request was of an earlier run; it is made again by itself",
         "",

@@ -56,6 +56,8 @@ pub enum NodeDrop {
     CheckWithheld,
     /// A check arrived while too many waited.
     CheckOverflowed,
+    /// A datagram of a DTLS link arrived while too many waited.
+    DtlsOverflowed,
     /// An operation was requested again, and not carried out again.
     OperationRepeated,
     /// The local definition of a type differs from the announced one.
@@ -148,6 +150,7 @@ impl NodeDrop {
             Self::CandidateRefused => "candidate_refused",
             Self::CheckWithheld => "check_withheld",
             Self::CheckOverflowed => "check_overflowed",
+            Self::DtlsOverflowed => "dtls_overflowed",
             Self::OperationRepeated => "operation_repeated",
             Self::TypeDiffers => "type_differs",
             Self::TypeRefused => "type_refused",

@@ -52,6 +52,10 @@ impl Link for AnyLink {
         each!(self, l => l.has_bulk_lanes())
     }
 
+    fn uses_direct_socket(&self) -> bool {
+        each!(self, l => l.uses_direct_socket())
+    }
+
     async fn send_control(&self, frame: Bytes) -> Result<(), LinkError> {
         each!(self, l => l.send_control(frame).await)
     }

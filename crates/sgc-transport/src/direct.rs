@@ -1,6 +1,12 @@
-//! The sockets of dialled QUIC links in a second role: connectivity checks (ICE, RFC 8445) leave and arrive there, and
-//! peers whose checks were authentic may make links. A NAT gives each socket a mapping of its own, so the checks have to
-//! use the socket of the links.
+//! The sockets of dialled QUIC links in further roles: connectivity checks (ICE, RFC 8445) leave and arrive there,
+//! peers whose checks were authentic may make links, and dialled DTLS links borrow them. A NAT gives each socket a
+//! mapping of its own, so the checks have to use the socket of the links.
+//!
+//! Datagrams are told apart by their first bytes (RFC 9443), since peers do not clear the bit of QUIC here. Those of
+//! DTLS go to the borrower of their source address.
+
+#[cfg_attr(not(feature = "dtls"), expect(dead_code, reason = "only DTLS links borrow"))]
+mod borrowed;
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -17,6 +23,8 @@ use quinn::{AsyncUdpSocket, UdpPoller};
 use sgc_sync::lock;
 use sgc_wire::NodeId;
 use tokio::sync::mpsc;
+
+use self::borrowed::Borrowers;
 
 /// Most checks that wait for their receiver; further ones are dropped, as the network does.
 const CHECKS_WAITING_MAX: usize = 64;
@@ -53,16 +61,20 @@ struct DirectShared {
     /// Checks for which there was no room.
     overflowed: AtomicU64,
     sockets: Mutex<Sockets>,
+    borrowers: Borrowers,
 }
+
+/// The socket of one address family. A rebind replaces it.
+type FamilySocket = Arc<Mutex<Arc<dyn AsyncUdpSocket>>>;
 
 #[derive(Default)]
 struct Sockets {
-    v4: Option<Arc<dyn AsyncUdpSocket>>,
-    v6: Option<Arc<dyn AsyncUdpSocket>>,
+    v4: Option<FamilySocket>,
+    v6: Option<FamilySocket>,
 }
 
 impl Sockets {
-    fn like(&mut self, address: &SocketAddr) -> &mut Option<Arc<dyn AsyncUdpSocket>> {
+    fn like(&mut self, address: &SocketAddr) -> &mut Option<FamilySocket> {
         match address {
             SocketAddr::V4(_) => &mut self.v4,
             SocketAddr::V6(_) => &mut self.v6,
@@ -80,6 +92,7 @@ impl DirectHandle {
             checks,
             overflowed: AtomicU64::new(0),
             sockets: Mutex::default(),
+            borrowers: Borrowers::default(),
         };
         (Self { shared: Arc::new(shared) }, arriving)
     }
@@ -87,22 +100,24 @@ impl DirectHandle {
     /// Returns a socket that hands checks over, and uses it for checks from here on, in place of an earlier one.
     pub(crate) fn wrap(&self, inner: Arc<dyn AsyncUdpSocket>) -> io::Result<Arc<dyn AsyncUdpSocket>> {
         let local = inner.local_addr()?;
-        *lock(&self.shared.sockets).like(&local) = Some(Arc::clone(&inner));
+        match lock(&self.shared.sockets).like(&local) {
+            Some(socket) => *lock(socket) = Arc::clone(&inner),
+            none => *none = Some(Arc::new(Mutex::new(Arc::clone(&inner)))),
+        }
         Ok(Arc::new(CheckSocket { inner, port: local.port(), shared: Arc::clone(&self.shared) }))
     }
 
     /// Returns the ports of the sockets for IPv4 and IPv6.
     pub fn ports(&self) -> (Option<u16>, Option<u16>) {
         let sockets = lock(&self.shared.sockets);
-        let port =
-            |socket: &Option<Arc<dyn AsyncUdpSocket>>| Some(socket.as_ref()?.local_addr().ok()?.port());
+        let port = |socket: &Option<FamilySocket>| Some(lock(socket.as_ref()?).local_addr().ok()?.port());
         (port(&sockets.v4), port(&sockets.v6))
     }
 
     /// Sends a datagram, from the address that the system chooses. One that finds no room or no route is lost, like any
     /// other.
     pub fn send(&self, to: SocketAddr, datagram: &[u8]) {
-        let socket = lock(&self.shared.sockets).like(&to).clone();
+        let socket = self.shared.socket_like(&to).map(|socket| Arc::clone(&lock(&socket)));
         let transmit =
             Transmit { destination: to, ecn: None, contents: datagram, segment_size: None, src_ip: None };
         if let Some(Err(error)) = socket.map(|socket| socket.try_send(&transmit)) {
@@ -137,6 +152,17 @@ impl DirectHandle {
     pub fn overflowed(&self) -> u64 {
         self.shared.overflowed.load(Relaxed)
     }
+
+    /// Returns the number of datagrams of DTLS links that were dropped because too many waited.
+    pub fn dtls_overflowed(&self) -> u64 {
+        self.shared.borrowers.overflowed()
+    }
+}
+
+impl DirectShared {
+    fn socket_like(&self, address: &SocketAddr) -> Option<FamilySocket> {
+        lock(&self.sockets).like(address).clone()
+    }
 }
 
 impl fmt::Debug for DirectHandle {
@@ -145,7 +171,7 @@ impl fmt::Debug for DirectHandle {
     }
 }
 
-/// A socket whose checks go to somebody else than QUIC.
+/// A socket that QUIC shares with others.
 struct CheckSocket {
     inner: Arc<dyn AsyncUdpSocket>,
     port: u16,
@@ -155,28 +181,38 @@ struct CheckSocket {
 impl CheckSocket {
     /// Hands over the checks among received datagrams, and leaves the others.
     fn take_checks(&self, buf: &mut [u8], meta: &mut RecvMeta) {
-        let (len, stride) = (meta.len.min(buf.len()), meta.stride.max(1));
-        if !buf[..len].chunks(stride).any(is_check) {
-            return;
-        }
-        let (mut at, mut left) = (0, 0);
-        while at < len {
-            let end = (at + stride).min(len);
-            if is_check(&buf[at..end]) {
-                let datagram = Bytes::copy_from_slice(&buf[at..end]);
-                let check = CheckDatagram { port: self.port, to: meta.dst_ip, from: meta.addr, datagram };
-                if self.shared.checks.try_send(check).is_err() {
-                    self.shared.overflowed.fetch_add(1, Relaxed);
-                }
-            } else {
-                buf.copy_within(at..end, left);
-                left += end - at;
+        let Some(checks) = take_out(buf, meta, is_check) else { return };
+        for datagram in checks.chunks(meta.stride.max(1)) {
+            let datagram = checks.slice_ref(datagram);
+            let check = CheckDatagram { port: self.port, to: meta.dst_ip, from: meta.addr, datagram };
+            if self.shared.checks.try_send(check).is_err() {
+                self.shared.overflowed.fetch_add(1, Relaxed);
             }
-            at = end;
         }
-        // Quinn reads nothing of an empty batch.
-        meta.len = left;
     }
+}
+
+/// Takes the datagrams of one kind out of a batch, and leaves the others in it.
+fn take_out(buf: &mut [u8], meta: &mut RecvMeta, is_wanted: fn(&[u8]) -> bool) -> Option<Bytes> {
+    let (len, stride) = (meta.len.min(buf.len()), meta.stride.max(1));
+    if !buf[..len].chunks(stride).any(is_wanted) {
+        return None;
+    }
+    let mut taken = Vec::with_capacity(len);
+    let (mut at, mut left) = (0, 0);
+    while at < len {
+        let end = (at + stride).min(len);
+        if is_wanted(&buf[at..end]) {
+            taken.extend_from_slice(&buf[at..end]);
+        } else {
+            buf.copy_within(at..end, left);
+            left += end - at;
+        }
+        at = end;
+    }
+    // Quinn reads nothing of an empty batch.
+    meta.len = left;
+    Some(taken.into())
 }
 
 impl fmt::Debug for CheckSocket {
@@ -201,9 +237,16 @@ impl AsyncUdpSocket for CheckSocket {
         meta: &mut [RecvMeta],
     ) -> Poll<io::Result<usize>> {
         let count = ready!(self.inner.poll_recv(cx, bufs, meta))?;
-        if self.shared.takes_checks.load(Relaxed) {
+        let takes_checks = self.shared.takes_checks.load(Relaxed);
+        let has_borrowers = self.shared.borrowers.are_some();
+        if takes_checks || has_borrowers {
             for (buf, meta) in bufs.iter_mut().zip(meta).take(count) {
-                self.take_checks(buf, meta);
+                if takes_checks {
+                    self.take_checks(buf, meta);
+                }
+                if has_borrowers {
+                    self.shared.borrowers.take_theirs(buf, meta);
+                }
             }
         }
         Poll::Ready(Ok(count))
@@ -226,8 +269,7 @@ impl AsyncUdpSocket for CheckSocket {
     }
 }
 
-/// Returns `true` for a datagram with the header of STUN. QUIC may clear the bit that tells its packets apart (RFC 9287),
-/// but its packets do not have the cookie and this length, unless by a chance of one in 2⁴⁸.
+/// Returns `true` for a datagram with the header of STUN.
 fn is_check(datagram: &[u8]) -> bool {
     let Some((header, rest)) = datagram.split_at_checked(STUN_HEADER_BYTES) else { return false };
     header[0] < 4
@@ -315,6 +357,65 @@ mod tests {
             receive(&socket).await;
         }
         assert_eq!(handle.overflowed(), CHECKS_WAITING_MAX as u64);
+    }
+
+    #[cfg(feature = "dtls")]
+    #[tokio::test]
+    async fn datagrams_go_to_the_borrower_at_their_source() {
+        let (handle, _checks) = DirectHandle::new();
+        let any = SocketAddr::from(([127, 0, 0, 1], 0));
+        let bind = || socket::bind(any, &LinkOptions::default()).unwrap();
+        let (inner, local) = bind();
+        let socket = handle.wrap(inner).unwrap();
+        let ((peer, peer_addr), (other, _)) = (bind(), bind());
+        let is_theirs = |datagram: &[u8]| datagram[0] == 0x17;
+        let borrowed = handle.borrow(peer_addr, is_theirs).unwrap();
+        assert_eq!(borrowed.local_addr().unwrap(), local);
+        assert!(handle.borrow(peer_addr, is_theirs).is_none(), "it is taken");
+        assert!(handle.borrow("[::1]:9".parse().unwrap(), is_theirs).is_none(), "there is no IPv6");
+        let send = |from: &Arc<dyn AsyncUdpSocket>, contents: &[u8]| {
+            let transmit =
+                Transmit { destination: local, ecn: None, contents, segment_size: None, src_ip: None };
+            from.try_send(&transmit).unwrap();
+        };
+        send(&other, &[0x17; 40]);
+        assert_eq!(receive(&socket).await, [0x17; 40], "of somebody else");
+        for byte in [0x17, 0x40, 0x17, 0x41] {
+            send(&peer, &[byte; 40]);
+        }
+        let mut quic = Vec::new();
+        while quic.len() < 80 {
+            quic.extend(receive(&socket).await);
+        }
+        assert_eq!(quic, [[0x40; 40], [0x41; 40]].concat());
+        let mut theirs = receive(&borrowed).await;
+        if theirs.len() < 80 {
+            theirs.extend(receive(&borrowed).await);
+        }
+        assert_eq!(theirs, [0x17; 80]);
+        // The borrower is slow.
+        for _ in 0..borrowed::BATCHES_WAITING_MAX + 3 {
+            send(&peer, &[0x17; 40]);
+            send(&other, &[0x43; 40]);
+            receive(&socket).await;
+        }
+        assert_eq!(handle.dtls_overflowed(), 3);
+        // A rebind, after which the earlier socket keeps what it has.
+        let (inner, local) = bind();
+        let _socket = handle.wrap(inner).unwrap();
+        let again = handle.borrow_again(peer_addr, is_theirs).unwrap();
+        assert_eq!((borrowed.local_addr().unwrap(), again.local_addr().unwrap()), (local, local));
+        receive(&borrowed).await;
+        drop(borrowed);
+        assert!(handle.borrow(peer_addr, is_theirs).is_none(), "the earlier socket freed the place");
+        let mut freed = handle.freed();
+        drop(again);
+        assert!(freed.has_changed().unwrap());
+        freed.mark_unchanged();
+        let last = handle.borrow(peer_addr, is_theirs).unwrap();
+        handle.give_back(peer_addr);
+        assert!(freed.has_changed().unwrap() && handle.borrow(peer_addr, is_theirs).is_some());
+        drop(last);
     }
 
     #[tokio::test]

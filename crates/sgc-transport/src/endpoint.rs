@@ -167,7 +167,8 @@ impl Dialer {
     }
 
     /// Opens the sockets from which QUIC links are dialled for connectivity checks, and for links of peers that are
-    /// expected after them. Call it before the first dial. Needs a tokio runtime around it.
+    /// expected after them. DTLS links are dialled from them as well, one at a time to each remote address. Call it
+    /// before the first dial. Needs a tokio runtime around it.
     pub fn open_direct(&self) -> DirectSockets {
         let (handle, checks) = DirectHandle::new();
         let listen = |listener: QuicListener| Listener {
@@ -175,6 +176,7 @@ impl Dialer {
             kind: Kind::Quic(listener),
         };
         let listeners = self.quic.open_direct(&handle).into_iter().map(listen).collect();
+        self.dtls.open_direct(&handle);
         DirectSockets { listeners, checks, handle }
     }
 
@@ -241,6 +243,7 @@ impl Dialer {
     /// choose now. Callers do this when addresses or routes have changed. Links live on, and lost packets are sent
     /// again. Every socket is tried; the first error is returned, and its links stay where they are.
     pub fn rebind(&self) -> io::Result<()> {
+        // QUIC comes first: DTLS links may borrow its sockets.
         let results = [self.quic.rebind(), self.udp.rebind(), self.dtls.rebind()];
         results.into_iter().collect()
     }

@@ -32,6 +32,12 @@ pub trait Link: Clone + Send + Sync + 'static {
     /// Returns `true` if the peer dials or takes bulk lanes of this link ([`crate::LinkOptions::bulk_lanes`]).
     fn has_bulk_lanes(&self) -> bool;
 
+    /// Returns `true` if this node dialled from a socket of [`crate::Dialer::open_direct`], so that the peer sees the
+    /// address that direct links have. It may become so after a while.
+    fn uses_direct_socket(&self) -> bool {
+        false
+    }
+
     /// Sends a control frame of at most [`crate::CONTROL_FRAME_BYTES_MAX`]: reliable, in order, not copied. If the
     /// future is dropped, the frame is either not sent or sent as a whole.
     fn send_control(&self, frame: Bytes) -> impl Future<Output = Result<(), LinkError>> + Send;

@@ -25,7 +25,7 @@ pub(crate) enum MappingOff {
     Configured,
     #[error("this node makes no direct links")]
     NoDirectLinks,
-    #[error("no router over QUIC sees a NAT")]
+    #[error("no router over QUIC or DTLS sees a NAT")]
     NoNat,
     #[error("this host has no IPv4 gateway")]
     NoGateway,

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use sgc_trust::VerifiedPeer;
 
 use crate::credentials::CredentialStore;
+use crate::direct::DirectHandle;
 use crate::error::{CloseReason, DialError, LinkError, Refusal};
 use crate::framing::Greeting;
 use crate::metrics::TransportMetrics;
@@ -68,6 +69,8 @@ impl DtlsDialer {
     pub(crate) fn new(_: CredentialStore, _: LinkOptions, _: Arc<TransportMetrics>) -> Self {
         Self
     }
+
+    pub(crate) fn open_direct(&self, _: &DirectHandle) {}
 
     pub(crate) async fn dial_at(
         &self,

@@ -78,6 +78,12 @@ pub(super) fn sort(datagram: &[u8]) -> Option<DatagramKind<'_>> {
     }
 }
 
+/// Returns `true` for a datagram that a listener may have sent. QUIC sends none like it, as long as it does not clear
+/// the bit that tells its packets apart: its long headers are longer than the messages that begin like them.
+pub(super) fn is_from_listener(datagram: &[u8]) -> bool {
+    !matches!(sort(datagram), None | Some(DatagramKind::Id(..) | DatagramKind::Ticket(..)))
+}
+
 pub(super) fn id_prefix(id: u64) -> Vec<u8> {
     [&[ID], &id.to_be_bytes()[..]].concat()
 }

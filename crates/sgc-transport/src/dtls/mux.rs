@@ -1,9 +1,9 @@
 //! All associations of one UDP socket, and the socket that quinn sees.
 //!
 //! Quinn sees the peers' real addresses and validates them when they change, as in any QUIC. This module only finds the
-//! association of a datagram and checks that it is authentic. A dialer has a socket for each association, so datagrams
-//! from listeners need no id. A listener finds established associations by the id that it gave them, and the others by
-//! address.
+//! association of a datagram and checks that it is authentic. A dialer has a socket for each association, or the
+//! datagrams from its listener at a socket that it shares, so these need no id. A listener finds established
+//! associations by the id that it gave them, and the others by address.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt;

@@ -264,7 +264,7 @@ impl Acceptor {
             Ok((greeting, control)) => {
                 let ended = claim.as_ref().map(Claim::ended);
                 let places = Places::new(self.options.flows_max);
-                let held = LinkResources { fate, places, lease, claim };
+                let held = LinkResources { fate, places, lease, claim, uses_direct_socket: Arc::default() };
                 let link = link(connection, &findings, false, greeting, control, held);
                 let link = link.map_err(Refusal::Certificate)?;
                 if let Some(ended) = ended {
@@ -324,7 +324,8 @@ impl QuicDialer {
             }
         };
         let (remote, (connection, parts)) = race::first(addresses, connect).await.map_err(failed)?;
-        let greeted = greet(connection, parts, greeting, &self.options).await;
+        let uses_direct_socket = Arc::new(AtomicBool::new(self.direct.get().is_some()));
+        let greeted = greet(connection, parts, greeting, &self.options, uses_direct_socket).await;
         let link = greeted.map_err(|e| failed(vec![(remote, e)]))?;
         self.metrics.count_dialed();
         Ok(link)
@@ -356,7 +357,11 @@ impl QuicDialer {
             return Ok(endpoint.clone());
         }
         let socket = self.bind(remote)?;
-        let config = config::endpoint(self.flavor, None, 0);
+        let mut config = config::endpoint(self.flavor, None, 0);
+        if self.direct.get().is_some() {
+            // The bit tells QUIC from DTLS and checks at this socket (RFC 9443, 4).
+            config.grease_quic_bit(false);
+        }
         let server =
             self.direct.get().map(|_| config::listener(self.flavor, &self.credentials, &self.options));
         let endpoint = Endpoint::new_with_abstract_socket(config, server, socket, Arc::new(PromptRuntime))?;
@@ -399,12 +404,13 @@ impl QuicDialer {
     }
 }
 
-/// Makes a link of an outgoing connection.
+/// Makes a link of an outgoing connection, which tells by the flag whether it uses a socket of direct links.
 pub(crate) async fn greet(
     connection: Connection,
     Parts { findings, gate, lease }: Parts,
     greeting: Greeting,
     options: &LinkOptions,
+    uses_direct_socket: Arc<AtomicBool>,
 ) -> Result<QuicLink, LinkError> {
     let fate = LinkEnd::new(options.idle_timeout);
     let after = options.handshake_timeout;
@@ -420,7 +426,7 @@ pub(crate) async fn greet(
     match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
         Ok((agreed, control)) => {
             let places = Places::new(options.flows_max);
-            let held = LinkResources { fate, places, lease, claim: None };
+            let held = LinkResources { fate, places, lease, claim: None, uses_direct_socket };
             link(connection, &findings, true, agreed, control, held).map_err(LinkError::RefusedHere)
         }
         Err(error) => {
@@ -460,6 +466,7 @@ struct LinkResources {
     places: Arc<Places>,
     lease: WindowLease,
     claim: Option<Claim>,
+    uses_direct_socket: Arc<AtomicBool>,
 }
 
 fn link(
@@ -468,7 +475,7 @@ fn link(
     is_dialer: bool,
     Greeting { lane, bulk_lanes }: Greeting,
     (control_tx, control_rx): (Outlet, ControlRx),
-    LinkResources { fate, places, lease, claim }: LinkResources,
+    LinkResources { fate, places, lease, claim, uses_direct_socket }: LinkResources,
 ) -> Result<QuicLink, CertError> {
     // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
     let peer = findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
@@ -492,6 +499,7 @@ fn link(
         places,
         _lease: lease,
         _claim: claim,
+        uses_direct_socket,
     };
     Ok(QuicLink { shared: Arc::new(shared) })
 }

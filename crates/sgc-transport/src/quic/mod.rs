@@ -21,6 +21,7 @@ pub(crate) use endpoint::{QuicDialer, QuicListener};
 use std::fmt;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -70,6 +71,7 @@ struct LinkInner {
     _lease: WindowLease,
     /// Hold on the association below.
     _claim: Option<Claim>,
+    uses_direct_socket: Arc<AtomicBool>,
 }
 
 /// The receiving half of the control stream.
@@ -142,6 +144,10 @@ impl Link for QuicLink {
 
     fn has_bulk_lanes(&self) -> bool {
         self.shared.bulk_lanes
+    }
+
+    fn uses_direct_socket(&self) -> bool {
+        self.shared.uses_direct_socket.load(Relaxed)
     }
 
     async fn send_control(&self, frame: Bytes) -> Result<(), LinkError> {

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use sgc_testkit::FakeDomain;
 
 use crate::flow::{Flow, LATE};
-use crate::lab::{Carrier, Lab, Nat, RANGES};
+use crate::lab::{Carrier, Lab, Nat, RANGES, schemes};
 use crate::node::Node;
 use crate::support::{eventually, say};
 use crate::{CALM, Pair, cable, can_run, is_long, shared_turn, turn};
@@ -189,8 +189,13 @@ fn nodes_behind_nats_get_a_direct_link_as_theory_says() {
 
 /// A robot and a desk with a direct link, and their router.
 fn direct_pair(lab: &Lab) -> (Node, Pair) {
+    direct_pair_by(lab, "quic")
+}
+
+/// The same, with links to the router by this transport alone.
+fn direct_pair_by(lab: &Lab, scheme: &'static str) -> (Node, Pair) {
     let cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
-    let pair = Pair::start(lab, "quic", &[&lab.url("quic")]);
+    let pair = Pair::start(lab, scheme, &[&lab.url(scheme)]);
     pair.wait_for("never begins", |_| 1);
     for node in [&pair.robot, &pair.desk] {
         eventually("a direct link", || direct_links(node) == 1);
@@ -482,6 +487,56 @@ fn data_goes_directly_while_the_router_restarts() {
     let outage = pair.flows.iter().map(|flow| flow.judge(begun).outage).max().unwrap().as_millis();
     say(&format!("\nThe router restarts while the data goes directly: {outage} ms without data at most"));
     assert!(carries(&pair.robot));
+    let wrong = judge(&pair);
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
+/// Returns the addresses from which the router sees a node.
+fn observed(node: &Node) -> Vec<String> {
+    let links = node.status()["links"].as_array().cloned().unwrap();
+    let of_routers = links.iter().filter(|link| link["direct"] == false);
+    of_routers.filter_map(|link| Some(link["observed"].as_str()?.to_owned())).collect()
+}
+
+#[test]
+fn nodes_whose_router_listens_for_dtls_get_a_direct_link_and_keep_it() {
+    // `schemes` says why not.
+    if !can_run() || !schemes().contains(&"dtls") {
+        return;
+    }
+    let _turn = turn();
+    let lab = Lab::new(cable(), Nat::PortRestricted);
+    lab.add_lte();
+    let (mut cloud, pair) = direct_pair_by(&lab, "dtls");
+    say("\nDirect links beside a router link by DTLS");
+    for _ in 0..if is_long() { 5 } else { 1 } {
+        // The link to the router and the direct one are on one socket, which moves.
+        for gateway in ["10.3.0.1", "10.1.0.1"] {
+            let before = observed(&pair.robot);
+            let begun = Instant::now();
+            lab.route_by(gateway);
+            eventually("the router sees another address", || {
+                let now = observed(&pair.robot);
+                !now.is_empty() && now.iter().all(|address| !before.contains(address))
+            });
+            direct_again(&pair, "the robot moves to another uplink", begun);
+        }
+        let begun = Instant::now();
+        drop(cloud);
+        pair.wait_for("does not go on without the router", |flow| flow.said() + 1);
+        cloud = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
+        for node in [&pair.robot, &pair.desk] {
+            eventually("both have the router again", || observed(node).len() == 1);
+        }
+        direct_again(&pair, "the router restarts", begun);
+        // A path that is cut and comes back is found by what the router has told since.
+        lab.cut_between_sites();
+        pair.wait_for("does not go on over the router", |flow| flow.said() + 1);
+        eventually("it is said", || why_not(&pair.desk).is_some());
+        let begun = Instant::now();
+        lab.join_sites();
+        direct_again(&pair, "the path comes back", begun);
+    }
     let wrong = judge(&pair);
     assert!(wrong.is_empty(), "{wrong:?}");
 }

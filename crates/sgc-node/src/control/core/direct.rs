@@ -74,10 +74,9 @@ impl<N: RosNetwork> Core<N> {
     /// Passes on the addresses from which routers see this node come.
     pub(super) fn reflexive_changed(&mut self) {
         let direct = &self.direct;
-        let seen = self.links.iter().filter(|(id, entry)| {
-            let is_quic = entry.url().is_some_and(|url| url.starts_with("quic://"));
-            is_quic && !direct.is_direct(*id)
-        });
+        // Other sockets have other mappings.
+        let seen =
+            self.links.iter().filter(|(id, entry)| entry.uses_direct_socket() && !direct.is_direct(*id));
         let seen: Vec<_> = seen.filter_map(|(_, entry)| entry.observed()).collect();
         self.direct.set_reflexive(Instant::now(), seen.into_iter());
     }

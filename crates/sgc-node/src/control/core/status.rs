@@ -167,15 +167,15 @@ impl<N: RosNetwork> Core<N> {
     /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some
     /// kinds.
     pub(super) fn all_drops(&self) -> BTreeMap<String, u64> {
-        let (withheld, candidates, overflowed) = self.direct.refusals();
         let kept = [
-            (NodeDrop::CheckWithheld, withheld),
-            (NodeDrop::CandidateRefused, candidates),
-            (NodeDrop::CheckOverflowed, overflowed),
             (NodeDrop::AuditLost, self.audit.lost_total()),
             (NodeDrop::AuditSummedUp, self.audit.summed_up_total()),
         ];
-        let kept = kept.into_iter().filter(|(_, n)| *n > 0).map(|(kind, n)| (kind.key().to_owned(), n));
+        let kept = kept
+            .into_iter()
+            .chain(self.direct.refusals())
+            .filter(|(_, n)| *n > 0)
+            .map(|(kind, n)| (kind.key().to_owned(), n));
         let mut all: BTreeMap<String, u64> = kept.collect();
         for counts in [
             self.control_drops.snapshot_by_name(&self.names),

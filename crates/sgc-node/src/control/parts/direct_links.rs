@@ -17,6 +17,7 @@ use tokio::sync::{mpsc, watch};
 use tracing::debug;
 
 use crate::admin::not_direct::NotDirectReason;
+use crate::drops::NodeDrop;
 use crate::link::direct_address::{DirectDial, HostAddress};
 use crate::link::mapping_report::{MappingOff, MappingReport, MappingWish};
 use crate::link::roaming::source_towards;
@@ -289,10 +290,18 @@ impl DirectLinks {
         }
     }
 
-    /// Returns the number of checks that were not sent, of refused candidates, and of checks for which there was no room.
-    pub(crate) fn refusals(&self) -> (u64, u64, u64) {
+    /// Iterates over the numbers of checks that were not sent, of refused candidates, and of checks and datagrams for
+    /// which there was no room.
+    pub(crate) fn refusals(&self) -> impl Iterator<Item = (NodeDrop, u64)> {
         let (withheld, candidates) = self.paths.refusals();
-        (withheld, candidates, self.ends.as_ref().map_or(0, |ends| ends.handle.overflowed()))
+        let handle = self.ends.as_ref().map(|ends| &ends.handle);
+        [
+            (NodeDrop::CheckWithheld, withheld),
+            (NodeDrop::CandidateRefused, candidates),
+            (NodeDrop::CheckOverflowed, handle.map_or(0, DirectHandle::overflowed)),
+            (NodeDrop::DtlsOverflowed, handle.map_or(0, DirectHandle::dtls_overflowed)),
+        ]
+        .into_iter()
     }
 
     pub(crate) fn handle_timeout(&mut self, now: Instant) {

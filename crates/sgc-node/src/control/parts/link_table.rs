@@ -252,6 +252,11 @@ impl LinkEntry {
         self.observed
     }
 
+    /// Returns `true` if that is the address from which direct links of this node come, too.
+    pub(crate) fn uses_direct_socket(&self) -> bool {
+        self.link.uses_direct_socket()
+    }
+
     /// Returns the measurements of the link, with the bytes of its lanes.
     pub(crate) fn stats(&self) -> LinkStats {
         let (stats, (sent, received)) = (self.link.stats(), self.control.lanes().bytes());
