@@ -99,6 +99,9 @@ pub enum NoDirectPath {
     /// The peer permits no direct link with this node.
     #[error("the peer permits no direct link with this node")]
     Refused,
+    /// The peer cannot tell its addresses now.
+    #[error("the peer knows none of its addresses yet, or has too many other attempts under way")]
+    Unready,
     /// No check was answered.
     #[error("no packet passes between the two networks: a NAT or a firewall on the way drops them")]
     Blocked,
@@ -284,10 +287,11 @@ impl DirectPaths {
         self.advance(now, node);
     }
 
-    /// Notes that the peer, or a router before it, refuses its addresses.
-    pub fn refused(&mut self, now: Instant, node: NodeId) {
+    /// Notes that the peer, or a router before it, refuses its addresses: for good, or for now.
+    pub fn refused(&mut self, now: Instant, node: NodeId, is_for_good: bool) {
         if self.peers.get(&node).is_some_and(|peer| peer.attempt.is_some()) {
-            self.fail(now, node, NoDirectPath::Refused);
+            let why = if is_for_good { NoDirectPath::Refused } else { NoDirectPath::Unready };
+            self.fail(now, node, why);
         }
     }
 

@@ -30,6 +30,8 @@ pub enum NotDirectReason {
     Unanswered,
     /// `direct` of the peer does not permit this node.
     Refused,
+    /// The peer knows none of its addresses yet, or has too many other searches under way.
+    Unready,
     /// No packet passes between the two networks.
     Blocked,
     /// Packets pass, and no link was made.
@@ -60,10 +62,11 @@ pub enum NotDirectReason {
 
 impl NotDirectReason {
     /// All reasons of this version.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::First,
         Self::Unanswered,
         Self::Refused,
+        Self::Unready,
         Self::Blocked,
         Self::NoLink,
         Self::Silent,
@@ -96,7 +99,13 @@ impl NotDirectReason {
                  this node"
             }
             Self::NotWanted => "`sgc why` at the peer says why there is none",
-            Self::First | Self::Silent | Self::Lost | Self::Busy | Self::OnlyRoutes | Self::Other => "",
+            Self::First
+            | Self::Unready
+            | Self::Silent
+            | Self::Lost
+            | Self::Busy
+            | Self::OnlyRoutes
+            | Self::Other => "",
         }
     }
 }
@@ -107,6 +116,7 @@ impl From<NoDirectPath> for NotDirectReason {
             NoDirectPath::First => Self::First,
             NoDirectPath::Unanswered => Self::Unanswered,
             NoDirectPath::Refused => Self::Refused,
+            NoDirectPath::Unready => Self::Unready,
             NoDirectPath::Blocked => Self::Blocked,
             NoDirectPath::NoLink => Self::NoLink,
             NoDirectPath::Silent => Self::Silent,
@@ -124,6 +134,7 @@ impl fmt::Display for NotDirectReason {
             Self::First => NoDirectPath::First.fmt(f),
             Self::Unanswered => NoDirectPath::Unanswered.fmt(f),
             Self::Refused => NoDirectPath::Refused.fmt(f),
+            Self::Unready => NoDirectPath::Unready.fmt(f),
             Self::Blocked => NoDirectPath::Blocked.fmt(f),
             Self::NoLink => NoDirectPath::NoLink.fmt(f),
             Self::Silent => NoDirectPath::Silent.fmt(f),

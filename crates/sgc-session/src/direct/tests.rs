@@ -114,7 +114,7 @@ impl Side {
 enum Signal {
     Question(PathQuestion),
     Offer(PathOffer),
-    Refusal,
+    Refusal { is_for_good: bool },
 }
 
 struct World {
@@ -235,11 +235,12 @@ impl World {
             match signal {
                 Signal::Question(question) => {
                     let offer = if side.permits { side.machine.asked(now, far, question) } else { None };
-                    let answer = offer.map_or(Signal::Refusal, Signal::Offer);
+                    let refusal = Signal::Refusal { is_for_good: !side.permits };
+                    let answer = offer.map_or(refusal, Signal::Offer);
                     self.signals.push((now + SIGNALS, 1 - at, answer));
                 }
                 Signal::Offer(offer) => side.machine.offered(now, far, &offer),
-                Signal::Refusal => side.machine.refused(now, far),
+                Signal::Refusal { is_for_good } => side.machine.refused(now, far, is_for_good),
             }
         }
         for side in &mut self.sides {
@@ -595,6 +596,19 @@ fn path_that_is_lost_soon_is_tried_again_later_and_later() {
     }
     assert!(waits[0] < Duration::from_secs(1) && waits[5] > Duration::from_secs(8), "{waits:?}");
     assert!(waits[1] < Duration::from_secs(4), "{waits:?}");
+}
+
+#[test]
+fn peer_without_addresses_is_asked_again_and_not_called_unwilling() {
+    let mut world = World::new([None, None]);
+    let local = world.sides[1].machine.local.clone();
+    world.sides[1].machine.set_local(world.now, Vec::new());
+    world.want(0);
+    world.run(Duration::from_millis(200));
+    assert_eq!(world.why_not(0), Some(NoDirectPath::Unready));
+    world.sides[1].machine.set_local(world.now, local);
+    world.run(Duration::from_secs(3));
+    assert!(world.linked.is_some());
 }
 
 #[test]

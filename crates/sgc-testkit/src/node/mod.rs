@@ -17,13 +17,13 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
     AskAgain, Delivery, Endpoint, EndpointConfig, Event, JoinKind, JoinStatus, Marks, Message,
-    RecoveryLimits, ShareSpec, Sink, SinkDrop, SinkLimits, Source, SourceConfig,
+    RecoveryLimits, RefusedBy, ShareSpec, Sink, SinkDrop, SinkLimits, Source, SourceConfig,
 };
 use sgc_router::{FibEntry, LinkClose, LinkId, LinkQuality, MappingKind, Neighbour, Router, RouterConfig};
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
-    Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
+    Name, NodeId, Now, Packet, Qos, RefuseReason, Reliability, SourceId,
 };
 
 use direct::DirectNode;
@@ -632,9 +632,10 @@ impl Running {
                     direct.paths.offered(now.instant, peer, &offer);
                 }
             }
-            Event::PathRefused { peer, .. } => {
+            Event::PathRefused { peer, by } => {
+                let is_for_good = by == RefusedBy::Owner(RefuseReason::NotPermitted);
                 if let Some(direct) = &mut self.direct {
-                    direct.paths.refused(now.instant, peer);
+                    direct.paths.refused(now.instant, peer, is_for_good);
                 }
             }
             Event::Recover(recover) => {

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::time::Instant;
 
 use bytes::Bytes;
+use sgc_endpoint::RefusedBy;
 use sgc_ros::{RosNetwork, Routes};
 use sgc_router::LinkId;
 use sgc_session::DirectOutput;
@@ -55,8 +56,9 @@ impl<N: RosNetwork> Core<N> {
         self.direct.offered(Instant::now(), peer, offer);
     }
 
-    pub(super) fn path_refused(&mut self, peer: NodeId) {
-        self.direct.refused(Instant::now(), peer);
+    pub(super) fn path_refused(&mut self, peer: NodeId, by: RefusedBy) {
+        let is_for_good = by == RefusedBy::Owner(RefuseReason::NotPermitted);
+        self.direct.refused(Instant::now(), peer, is_for_good);
     }
 
     pub(super) fn check_arrived(&mut self, check: &CheckDatagram) {

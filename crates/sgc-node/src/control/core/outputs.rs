@@ -119,7 +119,7 @@ impl<N: RosNetwork> Core<N> {
             Event::ReportRefused { name, by } => self.report_refused(name, by),
             Event::PathAsked { sink, peer, question } => self.path_asked(sink, &peer, &question),
             Event::PathOffered { peer, offer } => self.path_offered(peer, &offer),
-            Event::PathRefused { peer, .. } => self.path_refused(peer),
+            Event::PathRefused { peer, by } => self.path_refused(peer, by),
             Event::OperationAnswered { name, answer } => self.operation_answered(name, answer),
             Event::OperationDenied { name, by } => self.operation_denied(name, by),
             Event::Renewed { credentials } => self.take_credentials(credentials),

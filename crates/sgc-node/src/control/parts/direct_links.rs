@@ -186,8 +186,8 @@ impl DirectLinks {
         self.paths.offered(now, peer, offer);
     }
 
-    pub(crate) fn refused(&mut self, now: Instant, peer: NodeId) {
-        self.paths.refused(now, peer);
+    pub(crate) fn refused(&mut self, now: Instant, peer: NodeId, is_for_good: bool) {
+        self.paths.refused(now, peer, is_for_good);
     }
 
     pub(crate) fn not_dialled(&mut self, now: Instant, peer: NodeId) {
