@@ -5,13 +5,14 @@
 
 use std::fs;
 use std::io::Write as _;
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
+use sgc_testkit::netsim::Namespace;
 
 use super::{Dds, Running, System, Topic};
 use crate::compare::lab::{Lab, Side};
@@ -20,7 +21,8 @@ use crate::compare::program::Program;
 /// The addresses in the tunnel.
 const ADDRESSES: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 99, 0, 1), Ipv4Addr::new(10, 99, 0, 2)];
 const BITS_PREFIX: u8 = 24;
-const PORT: u16 = 51820;
+/// The UDP port of both ends.
+pub(crate) const PORT: u16 = 51820;
 /// MTU that WireGuard's own tool sets on a path of 1500 bytes.
 const MTU: u16 = 1420;
 /// Keep-alive interval in seconds that its manual recommends behind a NAT.
@@ -45,51 +47,60 @@ impl System for WireGuard {
         let keys = [Keys::make(&dir, Side::Left)?, Keys::make(&dir, Side::Right)?];
         let dds = Side::BOTH.map(|side| Dds::between(address(side), address(side.other())));
         let mut running = Running { processes: Vec::new(), dds };
-        let number = TUNNELS.fetch_add(1, Ordering::Relaxed);
         for side in [Side::Right, Side::Left] {
-            // Names of interfaces have at most 15 bytes.
-            let interface = format!("wg{}-{number}{}", std::process::id(), &side.name()[..1]);
-            let mut command = lab.command(side, "wireguard-go");
-            command.args(["--foreground", &interface]).env("LOG_LEVEL", "error");
-            let program = Program::start_daemon("wireguard-go", command, &lab.new_dir(side.name())?);
-            running.processes.push((side, program.context("wireguard-go")?));
-            until_exists(&Path::new(SOCKETS).join(format!("{interface}.sock")))?;
-            set_up(lab, side, &interface, &keys)?;
+            let dials = SocketAddr::new(lab.address(Side::Right), PORT);
+            let endpoint = (side == Side::Left).then_some((dials, KEEP_ALIVE_SECONDS));
+            let program = start(lab.place(side), &lab.new_dir(side.name())?, side, &keys, endpoint)?;
+            running.processes.push((side, program));
         }
         Ok(running)
     }
 }
 
-fn address(side: Side) -> IpAddr {
+/// The address of a place in the tunnel.
+pub(crate) fn address(side: Side) -> IpAddr {
     ADDRESSES[side as usize].into()
 }
 
-/// Keys, the other end, addresses.
-fn set_up(lab: &Lab, side: Side, interface: &str, keys: &[Keys; 2]) -> Result<()> {
+/// Starts an end of the tunnel. It sends to `endpoint`, if that is known, and a keep-alive there every so many seconds.
+pub(crate) fn start(
+    place: &Namespace,
+    dir: &Path,
+    side: Side,
+    keys: &[Keys; 2],
+    endpoint: Option<(SocketAddr, u16)>,
+) -> Result<Program> {
+    // Names of interfaces have at most 15 bytes.
+    let number = TUNNELS.fetch_add(1, Ordering::Relaxed);
+    let interface = format!("wg{}-{number}", std::process::id());
+    let mut command = place.command("wireguard-go");
+    command.args(["--foreground", &interface]).env("LOG_LEVEL", "error");
+    let program = Program::start_daemon("wireguard-go", command, dir).context("wireguard-go")?;
+    until_exists(&Path::new(SOCKETS).join(format!("{interface}.sock")))?;
     let [mine, others] = [side, side.other()].map(|side| &keys[side as usize]);
     let port = PORT.to_string();
-    let mut wg = lab.command(side, "wg");
-    wg.args(["set", interface, "listen-port", &port, "private-key"]).arg(&mine.private_file);
+    let mut wg = place.command("wg");
+    wg.args(["set", &interface, "listen-port", &port, "private-key"]).arg(&mine.private_file);
     wg.args(["peer", &others.public, "allowed-ips", &format!("{}/32", address(side.other()))]);
-    if side == Side::Left {
-        wg.args(["endpoint", &format!("{}:{PORT}", lab.address(Side::Right))]);
-        wg.args(["persistent-keepalive", &KEEP_ALIVE_SECONDS.to_string()]);
+    if let Some((endpoint, keep_alive_seconds)) = endpoint {
+        wg.args(["endpoint", &endpoint.to_string()]);
+        wg.args(["persistent-keepalive", &keep_alive_seconds.to_string()]);
     }
     output(wg, "")?;
-    let place = lab.place(side);
-    place.ip(&["address", "add", &format!("{}/{BITS_PREFIX}", address(side)), "dev", interface])?;
-    place.ip(&["link", "set", interface, "mtu", &MTU.to_string(), "up"])?;
-    Ok(())
+    place.ip(&["address", "add", &format!("{}/{BITS_PREFIX}", address(side)), "dev", &interface])?;
+    place.ip(&["link", "set", &interface, "mtu", &MTU.to_string(), "up"])?;
+    Ok(program)
 }
 
 /// The keys of one end.
-struct Keys {
+pub(crate) struct Keys {
     private_file: PathBuf,
     public: String,
 }
 
 impl Keys {
-    fn make(dir: &Path, side: Side) -> Result<Self> {
+    /// Makes new ones, with their files in `dir`.
+    pub(crate) fn make(dir: &Path, side: Side) -> Result<Self> {
         let wg = |what| {
             let mut command = Command::new("wg");
             command.arg(what);
