@@ -16,7 +16,7 @@ CLIENTS := $(addprefix --test ,foxglove grpc otlp rosbridge)
 COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \
 	SGC_COMMIT_DATE=$${SGC_COMMIT_DATE-$$(git log -1 --format=%cs 2>/dev/null)}
 
-.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
+.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-direct bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--duration 10s --json")'
@@ -47,6 +47,7 @@ help:
 	@echo '                 bench-routing (the cost of routing, beside a TCP relay and zenoh; ARGS="--quick")'
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
 	@echo '                 bench-gateway (gRPC and the rosbridge protocol)'
+	@echo '                 bench-direct (direct paths between two NATs, beside WireGuard and iroh; root, half an hour)'
 	@echo '                 bench-instructions (whether hot functions take more instructions than before; ARGS=--accept)'
 	@echo '                 bench-peers (build the systems that bench runs beside SGC)'
 
@@ -253,6 +254,14 @@ bench-transports: deps-build
 bench-gateway: build
 	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -p sgc-bench-load
 	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- gateway \
+		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
+
+# Builds iroh first, which takes minutes. ARGS="--quick", ARGS="--systems sgc-direct,iroh-direct".
+bench-direct: build
+	@scripts/install-deps.sh bench
+	$(CARGO) build --release --locked --manifest-path bench/iroh-peer/Cargo.toml --target-dir bench/iroh-peer/target
+	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -p sgc-bench-load
+	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- direct \
 		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
 # Builds the peers of `compare`: the Zenoh bridge (minutes, the first time), the load generator with DDS Security, and ROS 2.

@@ -85,6 +85,7 @@ fi
 if [ "$what" = bench ]; then
     need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "ROS 2 is installed into virtual environments"
     need 'command -v ip' iproute2 -- "separate networks for the compared systems (ip netns)"
+    need 'command -v nft' nftables -- "NATs between two sites"
     need 'command -v wireguard-go' wireguard-go -- "DDS over WireGuard"
     need 'command -v wg' wireguard-tools -- "DDS over WireGuard: its keys"
     need 'command -v openssl' openssl -- "certificates for Zenoh over TLS, a keystore for DDS Security"

@@ -1,10 +1,12 @@
 //! Benchmarks on real sockets; `README.md` says what each part measures and how to read it.
 //!
-//! This file knows the command line. The parts are [`compare`], [`forward`], [`gateway`], [`rib`], [`first_message`],
-//! [`teleop`] and [`transports`]; [`fleet`], [`node`], [`process`], [`report`] and [`uplink`] are shared.
+//! This file knows the command line. The parts are [`compare`], [`direct`], [`forward`], [`gateway`], [`rib`],
+//! [`first_message`], [`teleop`] and [`transports`]; [`fleet`], [`node`], [`process`], [`report`] and [`uplink`] are
+//! shared.
 #![forbid(unsafe_code)]
 
 mod compare;
+mod direct;
 mod first_message;
 mod fleet;
 mod forward;
@@ -51,6 +53,8 @@ enum Command {
     Report(ReportArgs),
     /// SGC beside its alternatives, in one run over emulated paths; needs root
     Compare(compare::CompareArgs),
+    /// Direct paths between two NATs, beside WireGuard and iroh; needs root
+    Direct(direct::DirectArgs),
     /// The far end of `transports`, in a process of its own
     #[command(hide = true)]
     ServeLinks(transports::ServeArgs),
@@ -127,6 +131,7 @@ fn main() -> Result<()> {
         Command::Gateway(args) => gateway::run(&args),
         Command::Report(args) => compare::Run::read(&args.run)?.render(&args.out),
         Command::Compare(args) => compare::run(args),
+        Command::Direct(args) => direct::run(&args),
         Command::MeasureLinks(args) => transports::measure_memory_here(&args),
         Command::ServeLinks(args) => transports::serve(&args),
         Command::ServeTcp => forward::tcp::serve(),

@@ -42,9 +42,10 @@ use plan::Breadth;
 use system::{Peers, System};
 
 pub(crate) use figures::Figures;
+pub(crate) use networks::Side;
 pub(crate) use program::Program;
 pub(crate) use report::Run;
-pub(crate) use system::Dds;
+pub(crate) use system::{Dds, wireguard};
 
 /// Measures a table.
 type Table = fn(&Compare, &mut Figures) -> Result<()>;

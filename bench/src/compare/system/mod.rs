@@ -4,7 +4,7 @@ mod direct;
 mod relay;
 mod security;
 mod sgc;
-mod wireguard;
+pub(crate) mod wireguard;
 mod zenoh;
 
 use std::path::{Path, PathBuf};
