@@ -16,9 +16,9 @@ const ALLOWED: f64 = 0.05;
 type Setting = (&'static str, u64);
 
 /// All measurements.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Figures {
-    load_before: f64,
+    loads: Vec<f64>,
     starts: BTreeMap<Setting, Vec<Start>>,
     /// Round trips of each round by size, µs.
     round_trips: BTreeMap<(Setting, usize), Vec<Vec<f64>>>,
@@ -30,17 +30,10 @@ pub(super) struct Figures {
 }
 
 impl Figures {
-    /// Returns none yet, with the load of the machine before the run.
-    pub(super) fn new() -> Self {
+    /// Notes the load of the machine before a round.
+    pub(super) fn begin_round(&mut self) {
         let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
-        Self {
-            load_before: load.split(' ').next().and_then(|load| load.parse().ok()).unwrap_or(0.0),
-            starts: BTreeMap::new(),
-            round_trips: BTreeMap::new(),
-            throughput: BTreeMap::new(),
-            router: BTreeMap::new(),
-            left_out: Vec::new(),
-        }
+        self.loads.extend(load.split(' ').next().and_then(|load| load.parse::<f64>().ok()));
     }
 
     pub(super) fn add_start(&mut self, setting: Setting, start: Start) {
@@ -95,7 +88,7 @@ impl Figures {
             bytes_per_second: rounds.clone(),
         });
         Rows {
-            load_before: self.load_before,
+            loads: self.loads.clone(),
             starts: starts.filter(|row| !row.first_ms.is_empty()).collect(),
             round_trips: round_trips.collect(),
             throughput: throughput.collect(),
@@ -123,8 +116,8 @@ impl Figures {
 /// The content of the file.
 #[derive(Debug, Serialize)]
 pub(super) struct Rows {
-    /// Load average of the last minute before the run.
-    load_before: f64,
+    /// Load average of the last minute before each round. From the second round on, this run is in it.
+    loads: Vec<f64>,
     starts: Vec<StartRow>,
     round_trips: Vec<RoundTripRow>,
     throughput: Vec<ThroughputRow>,

@@ -28,7 +28,6 @@ use crate::report::Report;
 const DELAYS_MS: [u64; 2] = [0, 10];
 /// Bytes of a message of the round trips.
 const SIZES: [usize; 2] = [100, 1000];
-const ROUNDS: usize = 5;
 /// Starts of a system in each round, beside the measured one.
 const STARTS: usize = 3;
 /// Time for which nothing is sent while the router's bytes are counted.
@@ -66,7 +65,10 @@ pub(crate) struct DirectArgs {
     /// These systems alone
     #[arg(long, value_name = "SYSTEM,…", value_delimiter = ',')]
     systems: Vec<String>,
-    /// A short run that shows that all parts work; its figures mean little
+    /// Rounds, in each of which every system has its turns
+    #[arg(long, value_name = "N", default_value_t = 5)]
+    rounds: usize,
+    /// A short run of one round that shows that all parts work; its figures mean little
     #[arg(long)]
     quick: bool,
 }
@@ -162,8 +164,9 @@ pub(crate) fn run(args: &DirectArgs) -> Result<()> {
         |system: &System| args.systems.is_empty() || args.systems.iter().any(|n| n == system.name());
     let systems: Vec<_> = SYSTEMS.into_iter().filter(is_asked).collect();
     let begun = Instant::now();
-    let mut figures = Figures::new();
-    for round in 0..if args.quick { 1 } else { ROUNDS } {
+    let mut figures = Figures::default();
+    for round in 0..if args.quick { 1 } else { args.rounds } {
+        figures.begin_round();
         for delay_ms in DELAYS_MS {
             for &system in &systems {
                 let seconds = begun.elapsed().as_secs();
