@@ -1,7 +1,7 @@
 //! WireGuard between the sites without a relay: each end knows the address of the other's NAT, and keeps its own open.
 
 use std::net::SocketAddr;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
@@ -14,6 +14,10 @@ use crate::compare::{Dds, Program, Side};
 
 /// The interval at which each end keeps its NAT open.
 const KEEP_ALIVE_SECONDS: u16 = 5;
+/// Time between the starts of the ends. Two ends that start within the delay of the path send their first handshakes
+/// across each other. Each then takes the other's and gives up its own, and `wireguard-go` of Debian 12 tries again in
+/// step with the other end, at times for more than a minute.
+const APART: Duration = Duration::from_secs(1);
 
 /// Fields go in this order.
 struct WireGuard {
@@ -32,6 +36,7 @@ pub(super) fn start(lab: &Lab, has_dds: bool) -> Result<(Box<dyn Pair>, Start)> 
         start_end(lab.site(side), &dir, side, &keys, Some((other, KEEP_ALIVE_SECONDS)))
     };
     let right = end(Side::Right)?;
+    std::thread::sleep(APART);
     let begun = Instant::now();
     let left = end(Side::Left)?;
     let both_up = begun.elapsed();
