@@ -100,6 +100,8 @@ pub(crate) struct Core<N: RosNetwork> {
     inbox: Inbox,
     links: LinkTable,
     direct: DirectLinks,
+    /// A grant came since the last look at the peers of direct links.
+    is_newly_granted: bool,
     forwards: ForwardTable,
     shares: Shares,
     closings: Closings,
@@ -244,6 +246,7 @@ impl<N: RosNetwork> Core<N> {
             inbox: Inbox::default(),
             links: LinkTable::new(parts.keep_alive_policy, parts.names.clone(), data.clone()),
             direct: DirectLinks::new(own, parts.direct, Grantees::default(), parts.rng),
+            is_newly_granted: false,
             forwards: ForwardTable::default(),
             shares,
             closings: Closings::default(),

@@ -119,6 +119,9 @@ impl<N: RosNetwork> Core<N> {
     /// Carries out what the search for direct paths wants. Returns `true` if there was something.
     pub(super) fn drain_direct(&mut self) -> bool {
         let mut progressed = false;
+        if std::mem::take(&mut self.is_newly_granted) {
+            self.look_at_direct(Instant::now());
+        }
         while let Some(output) = self.direct.poll() {
             progressed = true;
             match output {

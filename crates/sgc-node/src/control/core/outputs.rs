@@ -154,6 +154,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::Granted { name, sink, grant } => {
                 debug!(name = %name.short(), epoch = grant.epoch, "granted");
+                self.is_newly_granted = true;
                 let entry = grant.entry.as_deref().cloned();
                 if let Some(anew) = self.publishing_granted(now, name, &grant) {
                     debug!(name = %name.short(), "publishing under it");
