@@ -2,7 +2,8 @@
 //!
 //! The crate `igd-next` makes and reads the messages of the control protocol. Discovery and HTTP are here, because both
 //! have to be bounded: whoever is on the local network can answer a search. Only answers of the gateway count, all
-//! requests go to its address, answers are short, and none has a document type, whose entities could fill the memory.
+//! requests go to its address, answers are short and flat, and none has a document type, whose entities could fill the
+//! memory.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
@@ -46,6 +47,8 @@ const SERVICES: [&str; 3] = [
 const HTTP_BYTES_MAX: usize = 64 << 10;
 /// Most bytes of the heads of such an answer.
 const HEAD_BYTES_MAX: usize = 16 << 10;
+/// Most elements within each other. The parser of `igd-next` descends by recursion, and would overflow the stack.
+const NESTING_MAX: usize = 32;
 /// The description of mappings, which users of the gateway see.
 const DESCRIPTION: &str = "SGC direct links";
 
@@ -359,10 +362,27 @@ async fn exchange(
     let (_, answer) = tokio::join!(connection, answer);
     let text = String::from_utf8(answer?.into()).map_err(|_| MappingFailure::Malformed)?;
     // In UTF-16, which a parser may take, it would have zeros.
-    if text.contains("<!DOCTYPE") || text.contains('\0') {
+    if text.contains("<!DOCTYPE") || text.contains('\0') || nests_deeply(&text) {
         return Err(MappingFailure::Malformed);
     }
     Ok(text)
+}
+
+/// Returns `true` if too many elements are within each other, as far as the text is well-formed.
+fn nests_deeply(text: &str) -> bool {
+    let mut depth = 0;
+    for event in EventReader::new(text.as_bytes()) {
+        match event {
+            Ok(XmlEvent::StartElement { .. }) => depth += 1,
+            Ok(XmlEvent::EndElement { .. }) => depth -= 1,
+            Ok(_) => {}
+            Err(_) => return false,
+        }
+        if depth > NESTING_MAX {
+            return true;
+        }
+    }
+    false
 }
 
 #[cfg(test)]
@@ -467,10 +487,15 @@ mod tests {
         let many = format!("HTTP/1.1 200 OK\r\n{}\r\n", format!("A: {}\r\n", "b".repeat(1000)).repeat(100));
         let entities = "<!DOCTYPE a [<!ENTITY b \"bbbb\">]><a>&b;&b;</a>";
         let utf16: String = entities.chars().flat_map(|c| [c, '\0']).collect();
+        let deep = "<a>".repeat(NESTING_MAX + 1);
         let nonsense = "nonsense\r\n\r\n".to_owned();
-        for hostile in [response(&long), many, response(entities), response(&utf16), nonsense] {
+        for hostile in
+            [response(&long), many, response(entities), response(&utf16), response(&deep), nonsense]
+        {
             assert_eq!(ask(hostile).await, Err(MappingFailure::Malformed));
         }
+        let flat = format!("{}{}", "<a>".repeat(NESTING_MAX), "</a>".repeat(NESTING_MAX));
+        assert_eq!(ask(response(&flat)).await.unwrap(), flat);
         // A redirection is an answer without a description.
         let elsewhere = "HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:1/\r\nContent-Length: 0\r\n\r\n";
         assert_eq!(ask(elsewhere.to_owned()).await.unwrap(), "");
