@@ -197,7 +197,7 @@ fn partners_have_a_direct_link_if_both_name_each_other() {
     lab.write_config(
         "cloud",
         &[],
-        &format!("trust = [\"acme-ca.pem\"]\n[router]\nlisten = [\"quic://0.0.0.0:7447\"]\n"),
+        "trust = [\"acme-ca.pem\"]\n[router]\nlisten = [\"quic://0.0.0.0:7447\"]\n",
     );
     lab.write_config(
         "robot",
