@@ -25,8 +25,8 @@ const PAIRS_MAX: usize = 64;
 const SOURCES_MAX: usize = 32;
 /// Time for a better pair to answer, after one did.
 const SETTLE: Duration = Duration::from_millis(60);
-/// Most checks whose answers are measured.
-const CHECKS_MEASURED_MAX: usize = 256;
+/// Most checks whose answers are taken: more than an attempt sends.
+const CHECKS_MAX: usize = 1024;
 /// An address with a shorter round trip is taken instead of the agent's choice if that one's is longer by a quarter and
 /// by this.
 const CLEARLY_LONGER: Duration = Duration::from_millis(1);
@@ -59,9 +59,9 @@ pub(super) struct Attempt {
     until: Instant,
     /// Bytes that may still be sent to addresses that have not answered.
     allowance: usize,
-    /// Checks under way, with their times.
-    checks: BTreeMap<TransId, Instant>,
-    /// Addresses that answered a check, and so are of the peer, with the shortest round trip.
+    /// Checks under way, with their destinations and times.
+    checks: BTreeMap<TransId, (SocketAddr, Instant)>,
+    /// Addresses at which a check was received, and so are of the peer, with the shortest round trip.
     answered: BTreeMap<SocketAddr, Duration>,
     /// Addresses from which authentic checks came. Their senders may have forged them.
     sources: BTreeSet<SocketAddr>,
@@ -185,7 +185,14 @@ impl Attempt {
         if self.sources.len() >= SOURCES_MAX && !self.sources.contains(&from) {
             return;
         }
-        let answers = message.is_successful_binding_response().then(|| message.trans_id());
+        // Only the receiver of a check knows its transaction. An answer may be sent in the name of any address, so it shows
+        // that the peer is at the destination of the check. The agent keeps each address that an answer names, so it gets one
+        // answer to each check.
+        let answers =
+            message.is_successful_binding_response().then(|| self.checks.remove(&message.trans_id()));
+        if answers == Some(None) {
+            return;
+        }
         let packet = StunPacket { proto: Protocol::Udp, source: from, destination: to, message };
         if !self.agent.handle_packet(now, packet) {
             return;
@@ -193,9 +200,9 @@ impl Attempt {
         self.sources.insert(from);
         // A check may cause as many bytes as it has. Only an address that answers is known to be of the peer.
         self.allowance = self.allowance.saturating_add(bytes);
-        if let Some(sent) = answers.and_then(|id| self.checks.remove(&id)) {
+        if let Some((checked, sent)) = answers.flatten() {
             let round_trip = now.saturating_duration_since(sent);
-            let shortest = self.answered.entry(from).or_insert(round_trip);
+            let shortest = self.answered.entry(checked).or_insert(round_trip);
             *shortest = round_trip.min(*shortest);
         }
     }
@@ -226,8 +233,8 @@ impl Attempt {
                 self.allowance = left;
             }
             let check = StunMessage::parse(&datagram).ok().filter(StunMessage::is_binding_request);
-            if let Some(check) = check.filter(|_| self.checks.len() < CHECKS_MEASURED_MAX) {
-                self.checks.insert(check.trans_id(), now);
+            if let Some(check) = check.filter(|_| self.checks.len() < CHECKS_MAX) {
+                self.checks.insert(check.trans_id(), (to, now));
             }
             progress.sent.push((from, to, datagram));
         }
@@ -308,4 +315,46 @@ fn candidate(kind: CandidateKind, address: SocketAddr, base: SocketAddr) -> Resu
 fn credentials(user: [u8; 4], password: &SecretBytes) -> IceCreds {
     let hex = |bytes: &[u8]| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
     IceCreds { ufrag: hex(&user), pass: hex(password.expose()) }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
+
+    use rand_core::SeedableRng as _;
+
+    use super::*;
+
+    #[test]
+    fn agent_keeps_one_address_of_this_node_for_each_check() {
+        let now = Instant::now();
+        let places = [1, 2].map(|n| SocketAddr::from(([192, 0, 2, n], 5000)));
+        let host = |address| LocalAddress { kind: CandidateKind::Host, address, base: address };
+        let [mut near, mut far] = [(true, places[0]), (false, places[1])].map(|(is_controlling, address)| {
+            let mut rng = ChaCha20Rng::seed_from_u64(is_controlling.into());
+            Attempt::new(now, is_controlling, &[host(address)], &mut rng)
+        });
+        let (mut refused, mut withheld) = (0, 0);
+        assert!(far.take_offer(now, &near.offer(), &mut refused));
+        assert!(near.take_offer(now, &far.offer(), &mut refused));
+        let check = near.advance(now, &mut withheld).sent.remove(0).2;
+        let message = StunMessage::parse(&check).unwrap();
+        // An answer names the address from which the check seems to come.
+        let mut answers = 0;
+        for port in 1..=8 {
+            let seen = SocketAddr::from(([203, 0, 113, 7], port));
+            far.receive(now, places[1], seen, (message, check.len()));
+            let sent = far.advance(now, &mut withheld).sent;
+            for (_, _, answer) in sent.into_iter().filter(|(_, to, _)| *to == seen) {
+                let answer_message = StunMessage::parse(&answer).unwrap();
+                if answer_message.is_successful_binding_response() {
+                    assert!(near.accepts(&answer_message));
+                    near.receive(now, places[0], places[1], (answer_message, answer.len()));
+                    answers += 1;
+                }
+            }
+        }
+        assert_eq!((answers, near.agent.local_candidates().count()), (8, 2));
+        assert!(near.answered.contains_key(&places[1]));
+    }
 }

@@ -398,6 +398,54 @@ fn peer_that_forges_the_addresses_of_others_makes_nobody_send_more_than_it_did()
     assert!(sent > 0 && victims.len() <= 32, "{sent} bytes to {} addresses", victims.len());
 }
 
+/// Only the destination of a check is known to be of the peer, from whatever address its answer seems to come.
+#[test]
+fn peer_that_answers_in_the_name_of_others_makes_nobody_send_more_than_it_did() {
+    let mut world = World::new([None, None]);
+    let (now, liar) = (world.now, world.sides[1].node);
+    let (inside, own) = (world.sides[0].inside, world.sides[1].inside);
+    let mut answerer = DirectPaths::new(liar, ChaCha20Rng::seed_from_u64(3));
+    answerer.set_local(now, vec![LocalAddress { kind: CandidateKind::Host, address: own, base: own }]);
+    answerer.want(now, &[world.sides[0].node].into());
+    answerer.handle_timeout(now);
+    let question = std::iter::from_fn(|| answerer.poll()).find_map(|output| match output {
+        DirectOutput::Ask { question, .. } => Some(question),
+        _ => None,
+    });
+    let offer = world.sides[0].machine.asked(now, liar, question.unwrap()).unwrap();
+    let theirs = answerer.asked(now, world.sides[0].node, PathQuestion { attempt: offer.attempt }).unwrap();
+    answerer.offered(now, world.sides[0].node, &offer);
+    let victims: Vec<_> = (1..8).map(|n| SocketAddr::from(([198, 51, 100, n], 1000))).collect();
+    let host = |address: &SocketAddr| PathCandidate { kind: CandidateKind::Host, place: (*address).into() };
+    let candidates = victims.iter().chain([&own]).map(host).collect();
+    world.sides[0].machine.offered(now, liar, &PathOffer { candidates, ..theirs });
+    let (mut received, mut sent, mut answers) = (sgc_wire::PATH_OFFER_BYTES, 0, 0);
+    while world.now < now + DIRECT_ATTEMPT_MAX {
+        world.now += STEP;
+        world.sides[0].machine.handle_timeout(world.now);
+        while let Some(output) = world.sides[0].machine.poll() {
+            let DirectOutput::Send { to, datagram, .. } = output else { continue };
+            if to != own {
+                sent += datagram.len();
+                continue;
+            }
+            answerer.received(world.now, own, inside, &datagram);
+            while let Some(output) = answerer.poll() {
+                let DirectOutput::Send { datagram, .. } = output else { continue };
+                if !StunMessage::parse(&datagram).unwrap().is_successful_binding_response() {
+                    continue;
+                }
+                let victim = victims[answers % victims.len()];
+                received += datagram.len();
+                answers += 1;
+                world.sides[0].machine.received(world.now, inside, victim, &datagram);
+            }
+        }
+        assert!(sent <= received, "{sent} bytes for {received}");
+    }
+    assert!(sent > 0 && answers >= victims.len(), "{sent} bytes, {answers} answers");
+}
+
 #[test]
 fn addresses_of_this_host_and_of_one_segment_are_refused() {
     let mut world = World::new([None, None]);
