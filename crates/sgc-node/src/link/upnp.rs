@@ -2,7 +2,7 @@
 //!
 //! The crate `igd-next` makes and reads the messages of the control protocol. Discovery and HTTP are here, because both
 //! have to be bounded: whoever is on the local network can answer a search. Only answers of the gateway count, all
-//! requests go to its address, answers are short and flat, and none has a document type, whose entities could fill the
+//! requests go to its address, answers are short and simple, and none has a document type, whose entities could fill the
 //! memory.
 
 use std::collections::HashMap;
@@ -22,7 +22,7 @@ use sgc_session::{GrantedMapping, MAPPING_LIFETIME, MappingFailure, MappingProto
 use tokio::net::{TcpStream, UdpSocket};
 use tokio::time::{Instant, timeout_at};
 use tracing::debug;
-use xml::reader::{EventReader, XmlEvent};
+use xml::reader::{EventReader, ParserConfig2, XmlEvent};
 
 /// The address of the Simple Service Discovery Protocol.
 const SSDP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 255, 255, 250), 1900);
@@ -49,6 +49,14 @@ const HTTP_BYTES_MAX: usize = 64 << 10;
 const HEAD_BYTES_MAX: usize = 16 << 10;
 /// Most elements within each other. The parser of `igd-next` descends by recursion, and would overflow the stack.
 const NESTING_MAX: usize = 32;
+/// Most bytes of a name or an attribute in XML, and most attributes of an element.
+const XML_WORD_BYTES_MAX: usize = 512;
+const ATTRIBUTES_MAX: usize = 32;
+/// Most bytes of the namespaces of all elements. The parser of `igd-next` keeps, for each element, a copy of each that is
+/// declared around it: 64 KiB of text can become some GB.
+const NAMESPACE_BYTES_MAX: usize = 4 << 20;
+/// Bytes of memory for a namespace, beyond its prefix and its name.
+const NAMESPACE_BYTES: usize = 128;
 /// The description of mappings, which users of the gateway see.
 const DESCRIPTION: &str = "SGC direct links";
 
@@ -272,6 +280,10 @@ fn place_of(url: &str, gateway: Ipv4Addr) -> Option<(SocketAddrV4, String)> {
     }
     let port = NonZeroU16::new(authority.port_u16().unwrap_or(80))?;
     let path = uri.path_and_query().map_or("/", |path| path.as_str());
+    // `igd-next` takes what follows for another host.
+    if path.starts_with("//") || path.starts_with("/\\") {
+        return None;
+    }
     Some((SocketAddrV4::new(gateway, port.get()), path.to_owned()))
 }
 
@@ -362,27 +374,37 @@ async fn exchange(
     let (_, answer) = tokio::join!(connection, answer);
     let text = String::from_utf8(answer?.into()).map_err(|_| MappingFailure::Malformed)?;
     // In UTF-16, which a parser may take, it would have zeros.
-    if text.contains("<!DOCTYPE") || text.contains('\0') || nests_deeply(&text) {
+    if text.contains("<!DOCTYPE") || text.contains('\0') || !is_simple(&text) {
         return Err(MappingFailure::Malformed);
     }
     Ok(text)
 }
 
-/// Returns `true` if too many elements are within each other, as far as the text is well-formed.
-fn nests_deeply(text: &str) -> bool {
-    let mut depth = 0;
-    for event in EventReader::new(text.as_bytes()) {
+/// Returns `true` for no text, and for well-formed XML that needs little memory.
+fn is_simple(text: &str) -> bool {
+    let config = ParserConfig2::new()
+        .max_name_length(XML_WORD_BYTES_MAX)
+        .max_attribute_length(XML_WORD_BYTES_MAX)
+        .max_attributes(ATTRIBUTES_MAX);
+    let (mut depth, mut left) = (0, NAMESPACE_BYTES_MAX);
+    for event in EventReader::new_with_config(text.as_bytes(), config) {
         match event {
-            Ok(XmlEvent::StartElement { .. }) => depth += 1,
+            Ok(XmlEvent::StartElement { name, namespace, .. }) => {
+                depth += 1;
+                let own = name.namespace.map_or(0, |uri| uri.len());
+                let around =
+                    namespace.0.iter().map(|(prefix, uri)| prefix.len() + uri.len() + NAMESPACE_BYTES);
+                match left.checked_sub(own + around.sum::<usize>()) {
+                    Some(rest) if depth <= NESTING_MAX => left = rest,
+                    _ => return false,
+                }
+            }
             Ok(XmlEvent::EndElement { .. }) => depth -= 1,
             Ok(_) => {}
-            Err(_) => return false,
-        }
-        if depth > NESTING_MAX {
-            return true;
+            Err(_) => return text.is_empty(),
         }
     }
-    false
+    true
 }
 
 #[cfg(test)]
@@ -406,6 +428,8 @@ mod tests {
             "http://user@192.168.1.1/",
             "https://192.168.1.1/",
             "http://192.168.1.1:0/",
+            "http://192.168.1.1//203.0.113.9/",
+            "http://192.168.1.1/\\203.0.113.9/",
             "/root.xml",
             "",
         ] {
@@ -489,9 +513,31 @@ mod tests {
         let utf16: String = entities.chars().flat_map(|c| [c, '\0']).collect();
         let deep = "<a>".repeat(NESTING_MAX + 1);
         let nonsense = "nonsense\r\n\r\n".to_owned();
-        for hostile in
-            [response(&long), many, response(entities), response(&utf16), response(&deep), nonsense]
-        {
+        // Each element is in all of these namespaces, or in one with a long name.
+        let declared: String = (0..20).map(|n| format!(" xmlns:n{n}=\"b\"")).collect();
+        let within = |declared: &str| {
+            let elements = "<a/>".repeat((HTTP_BYTES_MAX - declared.len() - 7) / 4);
+            response(&format!("<a{declared}>{elements}</a>"))
+        };
+        let (namespaces, name) = (within(&declared), within(&format!(" xmlns=\"{}\"", "b".repeat(500))));
+        let attributes: String = (0..=ATTRIBUTES_MAX).map(|n| format!(" a{n}=\"\"")).collect();
+        let attributes = response(&format!("<a{attributes}/>"));
+        let word = response(&format!("<a b=\"{}\"/>", "b".repeat(2 * XML_WORD_BYTES_MAX)));
+        let [entities, utf16, deep] = [entities, &utf16, &deep].map(response);
+        for hostile in [
+            response(&long),
+            many,
+            entities,
+            utf16,
+            deep,
+            nonsense,
+            namespaces,
+            name,
+            attributes,
+            word,
+            response("<a>"),
+            response("text"),
+        ] {
             assert_eq!(ask(hostile).await, Err(MappingFailure::Malformed));
         }
         let flat = format!("{}{}", "<a>".repeat(NESTING_MAX), "</a>".repeat(NESTING_MAX));
@@ -512,6 +558,31 @@ mod tests {
             "<UPnPError><errorCode>{code}</errorCode><errorDescription>no</errorDescription></UPnPError>"
         );
         soap(&format!("<s:Fault><detail>{error}</detail></s:Fault>"))
+    }
+
+    #[tokio::test]
+    async fn requests_go_to_the_gateway_whatever_path_a_description_names() {
+        let address = soap(
+            "<u:GetExternalIPAddressResponse xmlns:u=\"x\"><NewExternalIPAddress>203.0.113.9</NewExternalIPAddress>\
+             </u:GetExternalIPAddressResponse>",
+        );
+        let mut asked = 0;
+        for path in [
+            "/ctl",
+            "ctl",
+            "/a//b",
+            "/..//127.0.0.2:9/",
+            "//127.0.0.2:9/",
+            "/\\127.0.0.2:9/",
+            "/@127.0.0.2:9/",
+        ] {
+            let at = answering(std::slice::from_ref(&address)).await;
+            let text = description("", &[("WANIPConnection:1", path)]);
+            let Some(igd) = Igd::described(&text, at, "/root.xml") else { continue };
+            assert_eq!(igd.gateway().get_external_ip().await.unwrap().to_string(), "203.0.113.9", "{path}");
+            asked += 1;
+        }
+        assert_eq!(asked, 5);
     }
 
     #[tokio::test]
