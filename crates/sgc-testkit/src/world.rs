@@ -33,6 +33,8 @@ const STEPS_MAX: usize = 300_000;
 const LOOK: Duration = Duration::from_millis(20);
 /// Silence after which a link seems dead.
 pub(crate) const SUSPECT_AFTER: Duration = Duration::from_millis(2500);
+/// As in `sgc-session`: least time until a link is dialled again that ended because another run has its place.
+const DISPLACED_MIN: Duration = Duration::from_secs(1);
 /// Bound of the `until_…` methods: longer than a lease and the longest wait between attempts.
 const PATIENCE: Duration = Duration::from_secs(350);
 
@@ -106,6 +108,10 @@ pub(crate) enum Pending {
     /// A look at a connection through NATs.
     Probe {
         wire: usize,
+    },
+    /// A dial of a configured link that was closed because another run of the node took its place.
+    Redial {
+        cable: usize,
     },
 }
 
@@ -1167,7 +1173,7 @@ impl World {
 
     fn deliver(&mut self, pending: Pending) {
         let (wire, to) = match &pending {
-            Pending::Input { .. } | Pending::Dial(_) | Pending::Probe { .. } => {
+            Pending::Input { .. } | Pending::Dial(_) | Pending::Probe { .. } | Pending::Redial { .. } => {
                 return self.deliver_unlinked(pending);
             }
             Pending::Frame { wire, to, .. }
@@ -1205,9 +1211,15 @@ impl World {
             }
             Pending::LinkDown { superseded, .. } => {
                 self.unplug(wire);
+                if superseded {
+                    let cable = self.wires[wire].cable;
+                    self.queue(self.clock.instant() + DISPLACED_MIN, Pending::Redial { cable });
+                }
                 Arrival::LinkDown(link, superseded)
             }
-            Pending::Input { .. } | Pending::Dial(_) | Pending::Probe { .. } => return,
+            Pending::Input { .. } | Pending::Dial(_) | Pending::Probe { .. } | Pending::Redial { .. } => {
+                return;
+            }
         };
         self.arrive(node, arrival);
     }
@@ -1223,6 +1235,7 @@ impl World {
             }
             Pending::Dial(dial) => self.try_dial(dial),
             Pending::Probe { wire } => self.probe(wire),
+            Pending::Redial { cable } => self.connect(cable),
             _ => {}
         }
     }

@@ -158,6 +158,35 @@ fn a_restarted_neighbour_supersedes_its_old_link_at_once() {
     assert_eq!(world.log().iter().filter(closed).count(), 1);
 }
 
+/// A router that restarted hears of the earlier run from another router, after the later one has greeted.
+#[test]
+fn run_whose_clock_is_behind_the_start_of_the_earlier_run_gets_its_link_back() {
+    for behind in [Duration::from_secs(300), Duration::from_secs(5000)] {
+        let mut world = World::new(8);
+        let (arm, east, west) = (world.proxy("arm-1"), world.router("east"), world.router("west"));
+        let desk = world.proxy("desk");
+        for (a, b, latency) in [(arm, east, ms(5)), (east, west, ms(40)), (west, desk, ms(5))] {
+            world.link_over(a, b, latency);
+        }
+        world.share(arm, "/chatter", Sharing::to_fleet());
+        world.use_topic(desk, arm, "/chatter");
+        world.until_granted(desk, arm, "/chatter");
+        world.crash(arm);
+        world.crash(east);
+        world.set_behind(arm, behind);
+        world.start(arm);
+        world.start(east);
+        world.run(ms(500));
+        let closed = |l: &&sgc_testkit::LogEntry| {
+            l.node == east && matches!(l.what, What::Closed { reason: LinkClose::Superseded { .. } })
+        };
+        assert_eq!(world.log().iter().filter(closed).count(), 1, "{}", world.trace());
+        world.set_ahead(arm, Duration::ZERO);
+        let granted = |world: &World| world.granted(arm, "/chatter") == [desk];
+        assert!(world.run_until(ms(10_000), granted), "{}", world.trace());
+    }
+}
+
 #[test]
 fn greetings_of_two_runs_that_cross_leave_the_newer_link() {
     // The old run's greeting is still in flight when the new run's arrives.
