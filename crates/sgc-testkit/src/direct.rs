@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use sgc_router::Neighbour;
+use sgc_router::{DirectReach, Neighbour};
 use sgc_session::NoDirectPath;
 use sgc_wire::{NodeId, PathOffer};
 
@@ -113,7 +113,9 @@ impl World {
             let remote = path.as_ref().map(|path| path.remotes[*side].ip());
             match remote {
                 None => copies.configured += count,
-                Some(remote) if self.datagrams.networks.is_near(node, remote) => copies.near += count,
+                Some(remote) if self.datagrams.networks.reach(node, remote) == DirectReach::Near => {
+                    copies.near += count
+                }
                 Some(_) => copies.far.extend(std::iter::repeat_n(ends[1 - *side].node, *count)),
             }
         }
@@ -222,9 +224,10 @@ impl World {
         routers
     }
 
-    /// Lets a node learn its address, and later the addresses at which its routers see it.
+    /// Lets a node learn its address and where its direct links lead, and later the addresses at which its routers see it.
     pub(crate) fn look_for_addresses(&mut self, node: NodeKey) {
         let (now, Some(host)) = (self.clock.instant(), self.datagrams.networks.address(node)) else { return };
+        self.look_where_links_lead(node);
         for (link, router) in self.routers_of(node) {
             let seen = self.datagrams.networks.seen_from(now, node, router_address(router));
             let running = self.nodes[node.0].running.as_ref();
@@ -240,6 +243,18 @@ impl World {
         if let Some(direct) = self.nodes[node.0].running.as_mut().and_then(|running| running.direct.as_mut())
         {
             direct.set_host(now, host);
+        }
+    }
+
+    /// Lets a node learn where its direct links lead. Either end of a link may have moved.
+    fn look_where_links_lead(&mut self, node: NodeKey) {
+        let now = self.now_at(node);
+        let Some(running) = &mut self.nodes[node.0].running else { return };
+        for (link, (wire, side)) in &running.links {
+            if let Some(path) = &self.wires[*wire].path {
+                let reach = self.datagrams.networks.reach(node, path.remotes[*side].ip());
+                running.router.handle_direct_reach(now, *link, reach);
+            }
         }
     }
 
@@ -323,7 +338,7 @@ impl World {
         let ends = [0, 1].map(|side| {
             let (node, now) = (nodes[side], self.now_at(nodes[side]));
             let peer = Neighbour::from(self.identity(nodes[1 - side]).as_peer());
-            let remote = (remotes[side], self.datagrams.networks.is_near(node, remotes[side].ip()));
+            let remote = (remotes[side], self.datagrams.networks.reach(node, remotes[side].ip()));
             let running = self.nodes[node.0].running.as_mut().expect("both nodes run");
             let link = running.new_found_link(now, wire, side, peer, remote);
             WireEnd { node, run: running.run, link, up: true, control: instant, data: BTreeMap::new() }

@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
 use std::time::Instant;
 
+use sgc_router::DirectReach;
+
 use crate::ids::NodeKey;
 use crate::nat::{Nat, NatKind};
 
@@ -89,11 +91,13 @@ impl Networks {
         self.hosts.get(&node)?.behind
     }
 
-    /// Returns `true` for an address of a network to which a host is attached.
-    pub(crate) fn is_near(&self, node: NodeKey, address: IpAddr) -> bool {
+    /// Returns where an address is for a host: in a network to which the host is attached, or elsewhere.
+    pub(crate) fn reach(&self, node: NodeKey, address: IpAddr) -> DirectReach {
         match (self.address(node).map(|own| own.ip()), address) {
-            (Some(IpAddr::V4(own)), IpAddr::V4(other)) => own.octets()[..3] == other.octets()[..3],
-            _ => false,
+            (Some(IpAddr::V4(own)), IpAddr::V4(other)) if own.octets()[..3] == other.octets()[..3] => {
+                DirectReach::Near
+            }
+            _ => DirectReach::Far,
         }
     }
 

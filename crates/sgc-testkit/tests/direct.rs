@@ -236,6 +236,30 @@ fn camera_with_several_viewers_sends_one_copy_over_its_uplink() {
     assert_eq!(viewing.publish("/image"), [1, 0, 1]);
 }
 
+/// A direct link goes with the node that dialled it. Its packets pass the uplink from here on, and later no more.
+#[test]
+fn camera_that_leaves_the_network_of_its_viewers_sends_one_copy_over_its_uplink_until_it_returns() {
+    let mut viewing = viewing(10, 2);
+    let mut nodes = [viewing.camera, viewing.viewers[0], viewing.viewers[1]];
+    // The node with the lesser id dials.
+    nodes.sort_by_key(|node| viewing.world.identity(*node).node_id());
+    (viewing.camera, viewing.viewers) = (nodes[0], nodes[1..].to_vec());
+    let home = viewing.world.nat(NatKind { mapping: None, ..NatKind::FULL_CONE }, None);
+    for node in nodes {
+        viewing.world.place(node, Some(home));
+    }
+    viewing.world.share(viewing.camera, "/image", Sharing::to_fleet());
+    viewing.view(0, "/image");
+    viewing.view(1, "/image");
+    assert_eq!(viewing.publish("/image"), [0, 0, 2]);
+    viewing.world.lose_checks(100);
+    for (place, copies) in [(None, [1, 0, 0]), (Some(home), [0, 0, 2])] {
+        viewing.world.place(viewing.camera, place);
+        viewing.world.run(Duration::from_secs(20));
+        assert_eq!(viewing.publish("/image"), copies);
+    }
+}
+
 /// An advertisement speaks for all names of its owner, also for those that are not told over a link.
 #[test]
 fn topic_of_one_viewer_brings_none_of_several_viewers_to_a_direct_link() {

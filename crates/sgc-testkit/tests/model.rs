@@ -25,7 +25,7 @@ const COMMITTED: &[u64] = &[
 ];
 /// The same for networks with NATs.
 const COMMITTED_NATS: &[u64] = &[
-    306, 436, 533, 572, 593, 652, 2049, 2277, 2529, 2909, // showed bugs
+    306, 436, 533, 572, 593, 652, 2049, 2277, 2529, 2909, 10350, // showed bugs
     1497, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20,
 ];
 /// Longest time from the last transition until all is as it should be: a lease, for what was not believed while a clock

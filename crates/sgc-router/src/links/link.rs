@@ -135,6 +135,11 @@ impl Link {
         self.direct
     }
 
+    /// Sets where a direct link leads. Returns `true` if that is elsewhere than before.
+    pub(super) fn set_direct_reach(&mut self, reach: DirectReach) -> bool {
+        self.direct.as_mut().is_some_and(|known| std::mem::replace(known, reach) != reach)
+    }
+
     /// Returns the kind of the paths over the link.
     pub(crate) fn path_kind(&self) -> PathKind {
         if self.direct.is_some() { PathKind::Direct } else { PathKind::Relayed }

@@ -261,6 +261,11 @@ impl Links {
 
     // ---- Measurements, clocks and certificates.
 
+    /// Sets where a direct link leads. Returns `true` if that is elsewhere than before.
+    pub(crate) fn set_direct_reach(&mut self, link: LinkId, reach: DirectReach) -> bool {
+        self.links.get_mut(&link).is_some_and(|state| state.set_direct_reach(reach))
+    }
+
     /// Takes a measurement of a link. Returns the node at its other end if the cost changed.
     pub(crate) fn measure(&mut self, now: Instant, link: LinkId, quality: LinkQuality) -> Option<NodeId> {
         let state = self.links.get_mut(&link)?;

@@ -442,7 +442,7 @@ impl Names {
         }
         self.questions.link_down(link);
         self.records.link_down(link);
-        self.withheld.link_down(link);
+        self.withheld.forget_link(link);
     }
 
     /// Forgets every route over a link. Returns their names.

@@ -275,6 +275,13 @@ impl Names {
         }
     }
 
+    /// Tells over a link the names that were withheld from it.
+    pub(crate) fn end_withholding(&mut self, cx: &mut Context<'_>, link: LinkId) {
+        self.withheld.forget_link(link);
+        let names = self.interests.names(link);
+        self.tell_interested(cx, link, &names);
+    }
+
     /// Tells names after all to nodes that did not find another path to them in time.
     pub(crate) fn release_withheld(&mut self, cx: &mut Context<'_>) {
         for (link, name) in self.withheld.release_due(cx.now.instant) {

@@ -91,8 +91,8 @@ impl Withheld {
         self.names.values().filter_map(until).min()
     }
 
-    /// Forgets a link that is gone.
-    pub(super) fn link_down(&mut self, link: LinkId) {
+    /// Forgets all that was withheld from a link.
+    pub(super) fn forget_link(&mut self, link: LinkId) {
         self.names.retain(|(other, _), _| *other != link);
     }
 }

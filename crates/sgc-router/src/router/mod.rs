@@ -23,7 +23,7 @@ use crate::context::Context;
 use crate::drops::DropReason;
 use crate::limits::allowances::Allowances;
 use crate::link_id::LinkId;
-use crate::links::{Link, LinkQuality, Links, Neighbour, PathKind};
+use crate::links::{DirectReach, Link, LinkQuality, Links, Neighbour, PathKind};
 use crate::names::Names;
 use crate::network::Network;
 use crate::output::{LinkClose, Output, Outputs};
@@ -126,6 +126,19 @@ impl Router {
         if self.links.cost_of_loss(link) != of_loss {
             self.names_part(|names, cx| names.loss_changed(cx, link));
         }
+    }
+
+    /// Takes the place to which a direct link leads now, since the addresses at both its ends may change. Has no effect on
+    /// other links.
+    pub fn handle_direct_reach(&mut self, now: Now, link: LinkId, reach: DirectReach) {
+        self.now = now;
+        if !self.links.set_direct_reach(link, reach) {
+            return;
+        }
+        if reach == DirectReach::Near {
+            self.names_part(|names, cx| names.end_withholding(cx, link));
+        }
+        self.spare_uplinks();
     }
 
     /// Takes a frame from a link.

@@ -112,7 +112,7 @@ impl DirectNode {
         now: Instant,
         link: LinkId,
         peer: NodeId,
-        (remote, is_near): (SocketAddr, bool),
+        (remote, reach): (SocketAddr, DirectReach),
     ) -> Option<DirectReach> {
         let is_direct = self.paths.is_expected(&peer, remote)
             // The successor of a direct link.
@@ -122,7 +122,7 @@ impl DirectNode {
         }
         self.links.insert(link, DirectLink { peer, is_silent: false, unused: None });
         self.paths.linked(now, peer);
-        Some(if is_near { DirectReach::Near } else { DirectReach::Far })
+        Some(reach)
     }
 
     /// Notes that a link ended.

@@ -19,7 +19,9 @@ use sgc_endpoint::{
     AskAgain, Delivery, Endpoint, EndpointConfig, Event, JoinKind, JoinStatus, Marks, Message,
     RecoveryLimits, RefusedBy, ShareSpec, Sink, SinkDrop, SinkLimits, Source, SourceConfig,
 };
-use sgc_router::{FibEntry, LinkClose, LinkId, LinkQuality, MappingKind, Neighbour, Router, RouterConfig};
+use sgc_router::{
+    DirectReach, FibEntry, LinkClose, LinkId, LinkQuality, MappingKind, Neighbour, Router, RouterConfig,
+};
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
@@ -305,7 +307,7 @@ impl Running {
         link
     }
 
-    /// Adds a link to a node at a remote address, which is near or not. The search for direct paths knows whether it comes
+    /// Adds a link to a node at a remote address, near or far. The search for direct paths knows whether it comes
     /// of an attempt.
     pub(crate) fn new_found_link(
         &mut self,
@@ -313,7 +315,7 @@ impl Running {
         wire: usize,
         side: usize,
         peer: Neighbour,
-        remote: (SocketAddr, bool),
+        remote: (SocketAddr, DirectReach),
     ) -> LinkId {
         let next = LinkId(self.next_link);
         let found =
