@@ -14,7 +14,7 @@ use tracing::{debug, info, warn};
 use super::Core;
 use crate::clock::now;
 use crate::control::event::LinkPlace;
-use crate::control::parts::link_table::EndedLink;
+use crate::control::parts::link_table::{EndedLink, LinkEntry};
 use crate::control::peers::control_queue::FrameRoom;
 use crate::data::stats::CountDrops;
 use crate::link::control_tx::ControlTx;
@@ -91,6 +91,11 @@ impl<N: RosNetwork> Core<N> {
         for (link, quality) in self.links.look(at) {
             self.router.handle_link_quality(now, link, quality);
             self.direct.link_looked_at(at, link, quality.is_silent);
+            // Either end of a direct link may have moved.
+            let remote = self.links.get(link).map(LinkEntry::remote);
+            if let Some(reach) = remote.and_then(|remote| self.direct.reach(link, remote)) {
+                self.router.handle_direct_reach(now, link, reach);
+            }
             self.tell_address(link);
         }
         self.look_at_direct(at);

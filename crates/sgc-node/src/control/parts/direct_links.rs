@@ -219,8 +219,14 @@ impl DirectLinks {
         }
         self.links.insert(link, DirectLink { peer, is_silent: false, unused: None });
         self.paths.linked(now, peer);
+        self.reach(link, remote)
+    }
+
+    /// Returns where a link to a remote address leads if it is a direct one.
+    pub(crate) fn reach(&self, link: LinkId, remote: SocketAddr) -> Option<DirectReach> {
         let is_near = self.host.iter().any(|host| host.is_near(remote.ip()));
-        Some(if is_near { DirectReach::Near } else { DirectReach::Far })
+        let reach = if is_near { DirectReach::Near } else { DirectReach::Far };
+        self.is_direct(link).then_some(reach)
     }
 
     /// Notes that a link ended.
