@@ -10,6 +10,7 @@
 
 mod addresses;
 mod attempt;
+mod links;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
@@ -18,10 +19,11 @@ use std::time::{Duration, Instant};
 use is::stun::StunMessage;
 use rand_chacha::ChaCha20Rng;
 use rand_core::RngCore as _;
-use sgc_wire::{NodeId, PathOffer, PathQuestion};
+use sgc_wire::{Decode as _, NodeId, PathOffer, PathQuestion, RefuseReason};
 
-pub use self::addresses::{LocalAddress, is_checkable};
+pub use self::addresses::{LocalAddress, REFLEXIVE_MAX, is_checkable, local_addresses};
 use self::attempt::{Attempt, Progress};
+pub use self::links::DirectLinkTable;
 use crate::backoff::doubled;
 
 /// Most peers with which this node has, or looks for, a direct path.
@@ -246,6 +248,21 @@ impl DirectPaths {
         self.peers.retain(|_, peer| !peer.is_idle() || peer.retry_at.is_some_and(|at| at > now));
     }
 
+    /// Answers the question of a peer. `is_permitted` says whether it may have a direct link.
+    pub fn answer(
+        &mut self,
+        now: Instant,
+        node: NodeId,
+        is_permitted: bool,
+        question: &[u8],
+    ) -> Result<PathOffer, RefuseReason> {
+        if !is_permitted {
+            return Err(RefuseReason::NotPermitted);
+        }
+        let question = PathQuestion::from_slice(question).map_err(|_| RefuseReason::RoleNotOffered)?;
+        self.asked(now, node, question).ok_or(RefuseReason::Limit)
+    }
+
     /// Takes the question of a peer that may have a direct link. Returns the answer; `None` if it asks too often, or
     /// there is no room.
     pub fn asked(&mut self, now: Instant, node: NodeId, question: PathQuestion) -> Option<PathOffer> {
@@ -395,15 +412,9 @@ impl DirectPaths {
         self.outputs.pop_front()
     }
 
-    /// Iterates over the peers with which data is exchanged and to which there is no direct path, with the reason.
-    pub fn relayed(&self) -> impl Iterator<Item = (NodeId, NoDirectPath)> {
-        let relayed = self.peers.iter().filter(|(_, peer)| peer.is_wanted && !peer.is_reached());
-        relayed.map(|(node, peer)| (*node, peer.why_not))
-    }
-
     /// Returns why there is no direct path to a peer; `None` if there is one, or nobody looks for one.
     pub fn why_not(&self, node: &NodeId) -> Option<NoDirectPath> {
-        self.peers.get(node).filter(|peer| peer.linked.is_none()).map(|peer| peer.why_not)
+        self.peers.get(node).filter(|peer| !peer.is_reached()).map(|peer| peer.why_not)
     }
 
     /// Returns `true` if this node exchanges data with a peer.

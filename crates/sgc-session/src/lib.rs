@@ -26,8 +26,8 @@ pub use bulk::{
 pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates, is_of_host};
 pub use claims::ClaimTable;
 pub use direct::{
-    DIRECT_ATTEMPT_MAX, DIRECT_ATTEMPTS_MAX, DIRECT_PEERS_MAX, DirectOutput, DirectPaths, LocalAddress,
-    NoDirectPath, is_checkable,
+    DIRECT_ATTEMPT_MAX, DIRECT_ATTEMPTS_MAX, DIRECT_PEERS_MAX, DirectLinkTable, DirectOutput, DirectPaths,
+    LocalAddress, NoDirectPath, REFLEXIVE_MAX, is_checkable, local_addresses,
 };
 pub use failback::Failback;
 pub use keep_alive::{ASK_MAX, Activity, KeepAlive, KeepAlivePolicy, LinkObservation, PeerState, Verdict};

@@ -83,7 +83,7 @@ impl World {
     pub fn why_not_direct(&self, node: NodeKey, other: NodeKey) -> Option<NoDirectPath> {
         let direct = self.nodes[node.0].running.as_ref()?.direct.as_ref()?;
         let id = self.identity(other).node_id();
-        direct.paths.relayed().find(|(peer, _)| *peer == id).map(|(_, why)| why)
+        direct.paths.why_not(&id)
     }
 
     fn direct_wires(&self, a: NodeKey, b: NodeKey) -> impl Iterator<Item = &Wire> {

@@ -261,7 +261,7 @@ impl World {
 
     fn why_not(&self, at: usize) -> Option<NoDirectPath> {
         let far = self.sides[1 - at].node;
-        self.sides[at].machine.relayed().find(|(node, _)| *node == far).map(|(_, why)| why)
+        self.sides[at].machine.why_not(&far)
     }
 }
 
@@ -685,6 +685,6 @@ fn peers_and_attempts_are_bounded() {
     assert_eq!((machine.peers.len(), machine.attempts()), (DIRECT_PEERS_MAX, DIRECT_ATTEMPTS_MAX));
     let one_more = node(3 * DIRECT_PEERS_MAX);
     assert_eq!(machine.asked(world.now, one_more, PathQuestion { attempt: 1 }), None);
-    let waiting = machine.relayed().filter(|(_, why)| *why == NoDirectPath::Busy).count();
+    let waiting = wanted.iter().filter(|node| machine.why_not(node) == Some(NoDirectPath::Busy)).count();
     assert_eq!(waiting, DIRECT_PEERS_MAX - DIRECT_ATTEMPTS_MAX);
 }

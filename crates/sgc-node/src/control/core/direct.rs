@@ -10,7 +10,7 @@ use sgc_router::LinkId;
 use sgc_session::DirectOutput;
 use sgc_transport::{CheckDatagram, CloseReason};
 use sgc_trust::{Grantees, VerifiedPeer};
-use sgc_wire::{Decode as _, NodeId, PathOffer, PathQuestion, RefuseReason, SinkId};
+use sgc_wire::{NodeId, PathOffer, RefuseReason, SinkId};
 
 use super::Core;
 use crate::admin::not_direct::{NotDirectPeer, NotDirectReason};
@@ -39,16 +39,10 @@ impl<N: RosNetwork> Core<N> {
 
     /// Answers a peer that asks for the addresses of this node.
     pub(super) fn path_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, question: &Bytes) {
-        let answer = match PathQuestion::from_slice(question) {
-            _ if !self.direct.may_meet(peer) => {
-                self.control_drops.count_from(NodeDrop::DirectNotPermitted, peer.node_id);
-                Err(RefuseReason::NotPermitted)
-            }
-            Ok(question) => {
-                self.direct.asked(Instant::now(), peer.node_id, question).ok_or(RefuseReason::Limit)
-            }
-            Err(_) => Err(RefuseReason::RoleNotOffered),
-        };
+        let answer = self.direct.answer(Instant::now(), peer, question);
+        if matches!(answer, Err(RefuseReason::NotPermitted)) {
+            self.control_drops.count_from(NodeDrop::DirectNotPermitted, peer.node_id);
+        }
         self.endpoint.answer_path(now(), sink, answer);
     }
 

@@ -1,18 +1,18 @@
 //! [`DirectLinks`]: the direct links of this node, and what is needed to find them.
 //!
-//! [`sgc_session::DirectPaths`] decides. This part has the sockets, and knows which links are direct.
+//! [`DirectPaths`] and [`DirectLinkTable`] decide. This part has the sockets, and the addresses of this host.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::net::{IpAddr, SocketAddr};
 use std::num::NonZeroU16;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use rand_chacha::ChaCha20Rng;
 use sgc_router::{DirectReach, LinkId, Router};
-use sgc_session::{DirectOutput, DirectPaths, LocalAddress};
+use sgc_session::{DirectLinkTable, DirectOutput, DirectPaths, LocalAddress};
 use sgc_transport::{CheckDatagram, DirectHandle};
 use sgc_trust::{Grantees, VerifiedPeer};
-use sgc_wire::{CandidateKind, NodeId, PATH_CANDIDATES_MAX, PathOffer, PathQuestion};
+use sgc_wire::{NodeId, PathOffer, RefuseReason};
 use tokio::sync::{mpsc, watch};
 use tracing::debug;
 
@@ -22,13 +22,6 @@ use crate::link::direct_address::{DirectDial, HostAddress};
 use crate::link::mapping_report::{MappingOff, MappingReport, MappingWish};
 use crate::link::roaming::source_towards;
 
-/// Most reflexive addresses that peers are told; routers at several places may see several.
-const REFLEXIVE_MAX: usize = 3;
-/// Time after which a direct link is closed over which neither node wants data.
-const UNUSED_MAX: Duration = Duration::from_secs(120);
-/// Time after which one is closed that has a better one beside it.
-const SUPERSEDED_MAX: Duration = Duration::from_secs(10);
-
 /// The sockets of direct links, and the task that dials.
 pub(crate) struct DirectEnds {
     pub(crate) handle: DirectHandle,
@@ -37,23 +30,13 @@ pub(crate) struct DirectEnds {
     pub(crate) mapping: watch::Sender<MappingWish>,
 }
 
-/// A direct link that is up.
-#[derive(Debug)]
-struct DirectLink {
-    peer: NodeId,
-    /// Whether nothing arrives over it.
-    is_silent: bool,
-    /// Time since which neither node wants data of the other, or a better link has the data.
-    unused: Option<Instant>,
-}
-
 /// The direct links of this node.
 pub(crate) struct DirectLinks {
     /// `None` at a node that only routes.
     ends: Option<DirectEnds>,
     paths: DirectPaths,
     permitted: Grantees,
-    links: BTreeMap<LinkId, DirectLink>,
+    links: DirectLinkTable<LinkId>,
     host: Vec<HostAddress>,
     reflexive: BTreeSet<SocketAddr>,
     /// The last IPv4 addresses that routers saw. They stay while no router is linked.
@@ -69,7 +52,7 @@ impl DirectLinks {
             ends,
             paths: DirectPaths::new(own, rng),
             permitted,
-            links: BTreeMap::new(),
+            links: DirectLinkTable::default(),
             host: Vec::new(),
             reflexive: BTreeSet::new(),
             seen_v4: BTreeSet::new(),
@@ -92,7 +75,7 @@ impl DirectLinks {
         self.permitted = permitted;
         self.wish_mapping();
         let is_gone = |link: &LinkId| peer_of(*link).is_some_and(|peer| self.permitted.find(&peer).is_none());
-        self.links.keys().copied().filter(is_gone).collect()
+        self.links.iter().filter(is_gone).collect()
     }
 
     /// Sets whether the configuration permits a port mapping.
@@ -177,9 +160,14 @@ impl DirectLinks {
         self.paths.want(now, &wanted);
     }
 
-    /// Takes the question of a peer that may have a direct link.
-    pub(crate) fn asked(&mut self, now: Instant, peer: NodeId, question: PathQuestion) -> Option<PathOffer> {
-        self.paths.asked(now, peer, question)
+    /// Answers the question of a peer.
+    pub(crate) fn answer(
+        &mut self,
+        now: Instant,
+        peer: &VerifiedPeer,
+        question: &[u8],
+    ) -> Result<PathOffer, RefuseReason> {
+        self.paths.answer(now, peer.node_id, self.may_meet(peer), question)
     }
 
     pub(crate) fn offered(&mut self, now: Instant, peer: NodeId, offer: &PathOffer) {
@@ -211,14 +199,7 @@ impl DirectLinks {
         peer: NodeId,
         remote: SocketAddr,
     ) -> Option<DirectReach> {
-        let is_direct = self.paths.is_expected(&peer, remote)
-            // The successor of a direct link, under another certificate.
-            || self.links.values().any(|known| known.peer == peer);
-        if !is_direct {
-            return None;
-        }
-        self.links.insert(link, DirectLink { peer, is_silent: false, unused: None });
-        self.paths.linked(now, peer);
+        self.links.link_up(now, &mut self.paths, link, peer, remote);
         self.reach(link, remote)
     }
 
@@ -231,52 +212,28 @@ impl DirectLinks {
 
     /// Notes that a link ended.
     pub(crate) fn link_down(&mut self, now: Instant, link: LinkId) {
-        let Some(DirectLink { peer, .. }) = self.links.remove(&link) else { return };
-        if self.links.values().all(|other| other.peer != peer) {
-            self.paths.ended(now, peer);
-        } else {
-            self.silence_changed(now, peer);
-        }
+        self.links.link_down(now, &mut self.paths, link);
     }
 
     /// Notes whether nothing arrives over a link.
     pub(crate) fn link_looked_at(&mut self, now: Instant, link: LinkId, is_silent: bool) {
-        let Some(direct) = self.links.get_mut(&link) else { return };
-        if std::mem::replace(&mut direct.is_silent, is_silent) != is_silent {
-            let peer = direct.peer;
-            self.silence_changed(now, peer);
-        }
-    }
-
-    fn silence_changed(&mut self, now: Instant, peer: NodeId) {
-        let is_silent = self.links.values().filter(|link| link.peer == peer).all(|link| link.is_silent);
-        self.paths.silent(now, peer, is_silent);
+        self.links.link_looked_at(now, &mut self.paths, link, is_silent);
     }
 
     /// Returns `true` for a direct link.
     pub(crate) fn is_direct(&self, link: LinkId) -> bool {
-        self.links.contains_key(&link)
+        self.links.is_direct(link)
     }
 
     /// Returns the direct links that nothing has used for a while.
     pub(crate) fn unused(&mut self, now: Instant, router: &Router) -> Vec<LinkId> {
-        let mut over = Vec::new();
-        for (link, direct) in &mut self.links {
-            let is_superseded = router.is_superseded(*link);
-            // Data that goes over a router to spare the uplink may come back.
-            let is_used = !is_superseded && (self.paths.is_wanted(&direct.peer) || router.is_used(*link));
-            let unused_max = if is_superseded { SUPERSEDED_MAX } else { UNUSED_MAX };
-            direct.unused = if is_used { None } else { direct.unused.or(Some(now)) };
-            if direct.unused.is_some_and(|since| now.saturating_duration_since(since) >= unused_max) {
-                over.push(*link);
-            }
-        }
-        over
+        let (is_superseded, is_used) = (|link| router.is_superseded(link), |link| router.is_used(link));
+        self.links.unused(now, &self.paths, is_superseded, is_used)
     }
 
     /// Iterates over the direct links to a peer.
     pub(crate) fn links_to(&self, peer: &NodeId) -> impl Iterator<Item = LinkId> {
-        self.links.iter().filter(|(_, link)| link.peer == *peer).map(|(id, _)| *id)
+        self.links.links_to(peer)
     }
 
     /// Returns why there is no direct link to a peer. `owner` is the peer if this node uses something of it.
@@ -354,40 +311,25 @@ fn mapping_wish(port: Option<NonZeroU16>, host: &[HostAddress], seen: &BTreeSet<
     }
 }
 
-/// Returns the addresses that peers are told: that of the port mapping, which admits every peer, those that routers see,
-/// then those of interfaces. `mapped` has the address of the interface, too.
+/// Returns the addresses that peers are told. `ports` are those of the sockets for IPv4 and IPv6.
 fn local_addresses(
     host: &[HostAddress],
     mapped: Option<(SocketAddr, IpAddr)>,
     reflexive: &BTreeSet<SocketAddr>,
     ports: (Option<u16>, Option<u16>),
 ) -> Vec<LocalAddress> {
-    let base = |host: &HostAddress| {
+    let socket = |host: &HostAddress| {
         let port = if host.ip.is_ipv4() { ports.0 } else { ports.1 };
         Some(SocketAddr::new(host.ip, port?))
     };
-    let hosts: Vec<_> = host.iter().filter_map(base).collect();
-    // The first interface of its family stands for all: the socket is the same.
-    let translated = |address: &SocketAddr, base: Option<&SocketAddr>| {
-        let is_translated = !hosts.contains(address);
-        let (kind, address, base) = (CandidateKind::ServerReflexive, *address, *base?);
-        is_translated.then_some(LocalAddress { kind, address, base })
-    };
-    let seen = |address: &SocketAddr| {
-        translated(address, hosts.iter().find(|host| host.is_ipv4() == address.is_ipv4()))
-    };
-    let external = mapped.map(|(external, _)| external);
-    let mapped =
-        mapped.and_then(|(external, ip)| translated(&external, hosts.iter().find(|host| host.ip() == ip)));
-    let of_host =
-        |address: &SocketAddr| LocalAddress { kind: CandidateKind::Host, address: *address, base: *address };
-    let others = reflexive.iter().filter(|address| Some(**address) != external);
-    let reflexive = others.filter_map(seen).take(REFLEXIVE_MAX);
-    mapped.into_iter().chain(reflexive).chain(hosts.iter().map(of_host)).take(PATH_CANDIDATES_MAX).collect()
+    let hosts: Vec<_> = host.iter().filter_map(socket).collect();
+    sgc_session::local_addresses(&hosts, mapped, reflexive)
 }
 
 #[cfg(test)]
 mod tests {
+    use sgc_session::REFLEXIVE_MAX;
+
     use super::*;
 
     #[test]
