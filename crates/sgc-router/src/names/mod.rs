@@ -143,13 +143,17 @@ impl Names {
 
     /// Returns `true` if a link is interested in a name of this node.
     pub(crate) fn wants_own(&self, link: LinkId) -> bool {
-        !self.own_wanted_by(link).is_empty()
+        self.interests.names(link).iter().any(|name| self.is_own(name))
     }
 
     /// Returns the names of this node in which a link is interested.
     pub(crate) fn own_wanted_by(&self, link: LinkId) -> Vec<Name> {
-        let is_own = |name: &Name| self.owner(name).is_some_and(|owner| owner.node_id == self.own);
-        self.interests.names(link).into_iter().filter(is_own).collect()
+        self.interests.names(link).into_iter().filter(|name| self.is_own(name)).collect()
+    }
+
+    /// Returns `true` for a name of this node.
+    pub(crate) fn is_own(&self, name: &Name) -> bool {
+        self.owner(name).is_some_and(|owner| owner.node_id == self.own)
     }
 
     /// Returns `true` if routers are told of names that they did not ask for.

@@ -191,10 +191,9 @@ impl Router {
     pub(super) fn spare_uplink_at(&mut self, link: LinkId, name: Name) {
         let links = &self.links;
         let Some((_, node)) = links.far().find(|(far, _)| *far == link) else { return };
-        let is_own = self.names.owner(&name).is_some_and(|owner| owner.node_id == self.config.node);
         let passes = |link| links.passes_uplink(link);
         let demand = Demand {
-            is_copied: is_own && links.has_copier(),
+            is_copied: self.names.is_own(&name) && links.has_copier(),
             others: self.trees.serves_others(&name, link, node, passes),
             is_served: self.trees.serves_elsewhere(&name, link, node),
         };
