@@ -29,6 +29,7 @@ mod network;
 mod output;
 mod router;
 mod shares;
+mod store;
 mod topology;
 mod trees;
 
@@ -41,4 +42,8 @@ pub use links::{DirectReach, LinkQuality, Neighbour, PathKind, clocks_differ};
 pub use mapping::MappingKind;
 pub use output::{LinkClose, Output};
 pub use router::{Router, RouterStats};
+pub use store::{
+    BATCH_TAG_LEN, BatchTag, StoreAction, StoreEvent, StoreFailure, StoreKey, StoreOp, StoreOpId, StoreReply,
+    WriteIf,
+};
 pub use topology::RouteStats;
