@@ -116,6 +116,7 @@ impl Machine {
             match self.router.poll_output() {
                 Output::Send { link, .. } => sent_to.push(link),
                 Output::Flush { link } => self.router.handle_flushed(self.now, link),
+                Output::Store(_) => {}
                 Output::Dropped(dropped) => bail!("the router refuses a frame: {}", dropped.reason),
                 Output::Close { reason, .. } => bail!("the router closes a link: {reason}"),
                 Output::Timeout(at) => {

@@ -1,12 +1,13 @@
 //! [`Context`]: the surroundings of a part while the router handles an event.
 
-use sgc_wire::{Control, NodeId, Now};
+use sgc_wire::{Control, Name, NodeId, Now};
 
 use crate::drops::{DropReason, RouterDrop};
 use crate::limits::allowances::{Allowance, Allowances};
 use crate::link_id::LinkId;
 use crate::network::Network;
 use crate::output::{Output, Outputs};
+use crate::store::{LookUpStart, Store};
 
 /// The time, the network to read, the allowances to charge, and the queue for effects in their order.
 #[derive(Debug)]
@@ -15,6 +16,8 @@ pub(crate) struct Context<'a> {
     pub(crate) network: Network<'a>,
     pub(crate) allowances: &'a mut Allowances,
     pub(crate) outputs: &'a mut Outputs,
+    /// The store, at a router that has one.
+    pub(crate) store: Option<&'a mut Store>,
 }
 
 impl Context<'_> {
@@ -34,6 +37,12 @@ impl Context<'_> {
     /// Returns the remaining allowance of a node.
     pub(crate) fn allowance(&mut self, node: &NodeId) -> &mut Allowance {
         self.allowances.node(self.now.instant, node)
+    }
+
+    /// Looks a name up in the store.
+    pub(crate) fn look_up(&mut self, name: Name) -> LookUpStart {
+        let now = self.now.instant;
+        self.store.as_mut().map_or(LookUpStart::Unavailable, |store| store.look_up(now, name))
     }
 
     /// Returns `true` if an announcement from `link` may be verified; otherwise it is dropped, because its neighbour

@@ -43,7 +43,7 @@ pub use mapping::MappingKind;
 pub use output::{LinkClose, Output};
 pub use router::{Router, RouterStats};
 pub use store::{
-    BATCH_TAG_LEN, BatchTag, StoreAction, StoreEvent, StoreFailure, StoreKey, StoreOp, StoreOpId, StoreReply,
-    WriteIf,
+    BATCH_TAG_LEN, BatchTag, STORE_VALUE_BYTES_MAX, StoreAction, StoreEvent, StoreFailure, StoreKey, StoreOp,
+    StoreOpId, StoreReply, StoreStats, WriteIf,
 };
 pub use topology::RouteStats;

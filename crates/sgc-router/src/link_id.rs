@@ -9,10 +9,16 @@ pub struct LinkId(pub u32);
 impl LinkId {
     /// The link to this node's own endpoint; always up.
     pub const LOCAL: Self = Self(0);
+    /// The store, as the bringer of announcements. It is no link: nothing is sent over it.
+    pub const STORE: Self = Self(u32::MAX);
 }
 
 impl fmt::Display for LinkId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if *self == Self::LOCAL { f.write_str("local") } else { write!(f, "link {}", self.0) }
+        match *self {
+            Self::LOCAL => f.write_str("local"),
+            Self::STORE => f.write_str("store"),
+            Self(number) => write!(f, "link {number}"),
+        }
     }
 }

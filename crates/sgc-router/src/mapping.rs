@@ -1,4 +1,4 @@
-//! Two rules by which routers learn the owners of names, behind one trait.
+//! Three rules by which routers learn the owners of names, behind one trait.
 //!
 //! A mapping decides which routers are told, and which are asked; `names/` keeps the records and sends the frames.
 //! Routers with different mappings understand each other: a router asks for names that it is not told.
@@ -14,6 +14,9 @@ pub enum MappingKind {
     /// Advertisements stay at the routers that the owner is attached to; others ask when somebody wants a name, and
     /// keep the answer for as long as it is wanted.
     Query,
+    /// As [`Self::Query`], but routers keep advertisements in a store that they share, and look names up there before
+    /// they ask.
+    Store,
 }
 
 /// Knowledge of the place of a name that somebody waits for.
@@ -21,8 +24,8 @@ pub enum MappingKind {
 pub(crate) enum NameLocation {
     /// Unknown, or its owner is out of reach.
     Unknown,
-    /// Known from a router that tells all names.
-    Flooded,
+    /// Known from a router that tells all names, or from the store, which reports changes.
+    Told,
     /// Known from an answer that came over this link.
     Answered(LinkId),
 }
@@ -45,7 +48,7 @@ pub(crate) trait Mapping: std::fmt::Debug + Send + Sync {
     fn ask(&self, known: NameLocation) -> Ask {
         match known {
             NameLocation::Unknown => Ask::Everyone,
-            NameLocation::Flooded => Ask::Nobody,
+            NameLocation::Told => Ask::Nobody,
             NameLocation::Answered(link) => Ask::One(link),
         }
     }
@@ -60,6 +63,7 @@ impl Mapping for Flood {
     }
 }
 
+/// The rule of [`MappingKind::Query`], and of [`MappingKind::Store`] for routers without that store.
 #[derive(Debug)]
 struct Query;
 
@@ -73,7 +77,7 @@ impl MappingKind {
     pub(crate) fn build(self) -> Box<dyn Mapping> {
         match self {
             Self::Flood => Box::new(Flood),
-            Self::Query => Box::new(Query),
+            Self::Query | Self::Store => Box::new(Query),
         }
     }
 }

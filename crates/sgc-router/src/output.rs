@@ -10,6 +10,7 @@ use sgc_wire::{Control, Name};
 use crate::drops::RouterDrop;
 use crate::fib::FibEntry;
 use crate::link_id::LinkId;
+use crate::store::StoreOp;
 
 /// Work for the driver.
 #[derive(Clone, Debug)]
@@ -44,6 +45,9 @@ pub enum Output {
         /// The link.
         link: LinkId,
     },
+    /// Carry out an operation of the store, and report its result by
+    /// [`Router::handle_store`](crate::Router::handle_store).
+    Store(StoreOp),
     /// A frame or body was dropped: count it and, where it matters, log it.
     Dropped(RouterDrop),
     /// Nothing more to do until this time, or until something happens.

@@ -116,7 +116,7 @@ impl Bench {
                 Output::Flush { link } if self.stuck => self.flushes.push(link),
                 Output::Flush { link } => self.router.handle_flushed(self.clock.now(), link),
                 Output::Close { link, .. } => self.closed.push(link.0),
-                Output::Trust(_) => {}
+                Output::Trust(_) | Output::Store(_) => {}
             }
         }
     }

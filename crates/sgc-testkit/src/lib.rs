@@ -45,6 +45,7 @@ mod record;
 mod rng;
 mod ros;
 mod seeds;
+mod store;
 mod trust;
 mod wires;
 mod world;
@@ -68,4 +69,5 @@ pub use record::{
 pub use rng::Dice;
 pub use ros::{FakeClient, FakeDomain, FakeReader, FakeRos, FakeServer, FakeWriter};
 pub use seeds::run_seeds;
+pub use store::StoreCounts;
 pub use world::{World, WorldConfig};

@@ -556,7 +556,11 @@ impl Mesh {
                 Output::Send { link, frame } => self.carry(station, link, frame),
                 Output::Dropped(dropped) => *self.tally.drops.entry(dropped.reason.key()).or_default() += 1,
                 Output::Close { reason, .. } => panic!("honest nodes close a link: {reason}"),
-                Output::Forward { .. } | Output::Trust(_) | Output::Timeout(_) | Output::Flush { .. } => {}
+                Output::Forward { .. }
+                | Output::Trust(_)
+                | Output::Timeout(_)
+                | Output::Flush { .. }
+                | Output::Store(_) => {}
             }
         }
         for frame in local {

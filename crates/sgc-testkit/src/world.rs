@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_endpoint::{Event, JoinKind, JoinStatus, PackedType};
-use sgc_router::{LinkClose, LinkId, MappingKind, Neighbour, RouterStats};
+use sgc_router::{LinkClose, LinkId, MappingKind, Neighbour, RouterStats, StoreOp};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of, paths_blind};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Consumer, Control, Decode, Encode, JoinBody, LinkStateBody,
@@ -25,6 +25,7 @@ use crate::record::{
     CapturedFrame, CapturedPacket, DataDrop, LogEntry, PublishedMessage, ReceivedMessage, What,
 };
 use crate::rng::Dice;
+use crate::store::SimStore;
 use crate::wires::{Cable, Content, Wire, WireEnd};
 
 /// Number of deliveries in one call of [`World::run`] above which the network counts as looping.
@@ -109,6 +110,12 @@ pub(crate) enum Pending {
     Probe {
         wire: usize,
     },
+    /// An operation of this run of a node at the store.
+    Store {
+        node: NodeKey,
+        run: u64,
+        op: StoreOp,
+    },
     /// A dial of a configured link that was closed because another run of the node took its place.
     Redial {
         cable: usize,
@@ -149,6 +156,7 @@ pub struct World {
     pub(crate) cables: Vec<Cable>,
     pub(crate) wires: Vec<Wire>,
     pub(crate) datagrams: Datagrams,
+    pub(crate) store: SimStore,
     queue: BTreeMap<(Instant, u64), Pending>,
     queued: u64,
     log: Vec<LogEntry>,
@@ -184,6 +192,7 @@ impl World {
             cables: Vec::new(),
             wires: Vec::new(),
             datagrams: Datagrams::default(),
+            store: SimStore::default(),
             queue: BTreeMap::new(),
             queued: 0,
             log: Vec::new(),
@@ -212,6 +221,11 @@ impl World {
     /// Adds and starts a node that only serves itself.
     pub fn proxy(&mut self, name: &str) -> NodeKey {
         self.node(Member::new(name), false)
+    }
+
+    /// Sets the mapping of routers that are added from here on.
+    pub fn set_mapping(&mut self, mapping: MappingKind) {
+        self.config.mappings = vec![mapping];
     }
 
     /// Adds and starts a node for a member, which carries names of others if `transit`.
@@ -257,6 +271,7 @@ impl World {
         let (now, seed) = (self.now_at(node), self.dice.number());
         self.nodes[node.0].start(now, seed, &self.directory);
         self.settle(node);
+        self.connect_store(node);
         for cable in self.cables_of(node) {
             self.connect(cable);
         }
@@ -1173,9 +1188,11 @@ impl World {
 
     fn deliver(&mut self, pending: Pending) {
         let (wire, to) = match &pending {
-            Pending::Input { .. } | Pending::Dial(_) | Pending::Probe { .. } | Pending::Redial { .. } => {
-                return self.deliver_unlinked(pending);
-            }
+            Pending::Input { .. }
+            | Pending::Dial(_)
+            | Pending::Probe { .. }
+            | Pending::Redial { .. }
+            | Pending::Store { .. } => return self.deliver_unlinked(pending),
             Pending::Frame { wire, to, .. }
             | Pending::Packet { wire, to, .. }
             | Pending::Quality { wire, to, .. }
@@ -1217,9 +1234,11 @@ impl World {
                 }
                 Arrival::LinkDown(link, superseded)
             }
-            Pending::Input { .. } | Pending::Dial(_) | Pending::Probe { .. } | Pending::Redial { .. } => {
-                return;
-            }
+            Pending::Input { .. }
+            | Pending::Dial(_)
+            | Pending::Probe { .. }
+            | Pending::Redial { .. }
+            | Pending::Store { .. } => return,
         };
         self.arrive(node, arrival);
     }
@@ -1236,6 +1255,7 @@ impl World {
             Pending::Dial(dial) => self.try_dial(dial),
             Pending::Probe { wire } => self.probe(wire),
             Pending::Redial { cable } => self.connect(cable),
+            Pending::Store { node, run, op } => self.serve_store((node, run), &op),
             _ => {}
         }
     }
@@ -1301,6 +1321,7 @@ impl World {
             Effect::Check(to, datagram) => self.send_check(node, to, datagram),
             Effect::Dial(peer, to) => self.dial(node, peer, to),
             Effect::Look => self.look_for_addresses(node),
+            Effect::Store(op) => self.operate_store(node, op),
             Effect::Delivered { owner, topic, id, use_number } => {
                 let (at, run) = (self.clock.elapsed(), self.nodes[node.0].runs);
                 self.received.push(ReceivedMessage { id, at, node, run, use_number, owner, topic });

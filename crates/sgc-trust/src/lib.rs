@@ -89,8 +89,8 @@ pub use server_certificate::{
     certificate_pin,
 };
 pub use signed::{
-    CLOCK_SKEW_MAX, SEQ_AHEAD_MAX, SignedError, VerifiedAdvert, VerifiedJoin, VerifiedLinkState, next_seq,
-    signed_digest, verify_advert, verify_answer, verify_join, verify_link_state,
+    CLOCK_SKEW_MAX, SEQ_AHEAD_MAX, SignedError, VerifiedAdvert, VerifiedJoin, VerifiedLinkState,
+    names_digest, next_seq, signed_digest, verify_advert, verify_answer, verify_join, verify_link_state,
 };
 pub use suite::{ParseSuiteError, Suite};
 pub use token::{ShareToken, TOKEN_PREFIX, TOKEN_ROUTERS_MAX, TOKEN_TEXT_BYTES_MAX, TokenError};

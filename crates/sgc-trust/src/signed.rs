@@ -199,6 +199,11 @@ pub fn signed_digest(signed: &SignedBody) -> [u8; 32] {
     crate::cert_id::sha256(&[&length, &signed.body, &signed.signature])
 }
 
+/// Returns a digest of names, in their order.
+pub fn names_digest(names: &[Name]) -> [u8; 32] {
+    crate::cert_id::sha256(&names.iter().map(|name| name.0.as_slice()).collect::<Vec<_>>())
+}
+
 /// Verifies an answer by the owner of the name.
 pub fn verify_answer(owner: &VerifiedPeer, signed: &SignedBody) -> Result<AnswerBody, SignedError> {
     let body = AnswerBody::from_slice(&signed.body)?;

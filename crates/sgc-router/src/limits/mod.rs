@@ -68,6 +68,8 @@ pub struct Limits {
     /// wait, and only the newest of them is taken. The CA of this node's own fleet has no such bound. Greater than
     /// [`sgc_trust::FLEET_LISTS_MAX`], so that all lists in force fit.
     pub lists_burst: u32,
+    /// Memory for values of the store that were read lately, bytes.
+    pub store_cache_bytes: usize,
     /// Unverifiable bodies that a node may bring before its link is closed; one is forgiven a second.
     pub forgeries_max: u32,
 }
@@ -96,6 +98,7 @@ impl Default for Limits {
             announcements_burst: 256,
             stale_burst: 256,
             lists_burst: 64,
+            store_cache_bytes: 32 << 20,
             forgeries_max: 64,
         }
     }

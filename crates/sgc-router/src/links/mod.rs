@@ -230,6 +230,18 @@ impl Links {
         self.of_node.get(node).into_iter().flatten().copied()
     }
 
+    /// Returns `true` for a node that greeted over a link of this one, and is no router.
+    pub(crate) fn is_attached(&self, node: &NodeId) -> bool {
+        self.of_node(node).any(|link| {
+            self.links.get(&link).is_some_and(|state| state.hello().is_some() && !state.is_router())
+        })
+    }
+
+    /// Iterates over the nodes that greeted over a link of this one, and are no routers.
+    pub(crate) fn attached(&self) -> impl Iterator<Item = NodeId> {
+        self.of_node.keys().copied().filter(|node| self.is_attached(node))
+    }
+
     /// Returns the best link to a neighbour: the cheapest, of about equal ones the newest.
     pub(crate) fn best_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
         let up = self.of_node(node).rev().filter_map(|link| {

@@ -14,6 +14,7 @@ use crate::limits::QUERY_EVERY;
 use crate::limits::allowances::Turn;
 use crate::link_id::LinkId;
 use crate::mapping::{Ask, NameLocation};
+use crate::store::{LookUpStart, Work};
 
 impl Names {
     /// Handles a question. The answer goes back over the link that brought the question first: copies over others are
@@ -47,6 +48,7 @@ impl Names {
             {
                 let (owner, from) = (record.owner_id(), record.link());
                 let again = record.asked().filter(|at| *at + QUERY_AGAIN <= now).is_some();
+                self.check_in_store(cx, name, &owner);
                 self.answer(cx, link, &owner, &[*name]);
                 self.tell_record(cx, link, name);
                 if again && from != link {
@@ -56,7 +58,10 @@ impl Names {
                 continue;
             }
             match self.questions.ask(now, link, peer.node, *name) {
-                Asked::PassOn => unknown.push(*name),
+                Asked::PassOn => {
+                    cx.look_up(*name);
+                    unknown.push(*name);
+                }
                 Asked::UnderWay => {}
                 Asked::TooMany => is_full = true,
             }
@@ -96,6 +101,15 @@ impl Names {
         }
     }
 
+    /// Lets the store be searched for a name of a node that is attached here: another router did not find it there.
+    fn check_in_store(&self, cx: &mut Context<'_>, name: &Name, owner: &NodeId) {
+        if cx.network.links.is_attached(owner)
+            && let Some(store) = &mut cx.store
+        {
+            store.add_work(Work::Check(*name));
+        }
+    }
+
     /// Asks other routers for names that somebody here waits for, if that is due.
     pub(crate) fn ask_due(&mut self, cx: &mut Context<'_>) {
         let now = cx.now.instant;
@@ -106,7 +120,9 @@ impl Names {
             match self.mapping.ask(location) {
                 Ask::Nobody => self.questions.stop_asking(&name),
                 Ask::Everyone => {
-                    everyone.push(name);
+                    if cx.look_up(name) == LookUpStart::Unavailable {
+                        everyone.push(name);
+                    }
                     let turn = self.turn(cx, &name, Turn::Again);
                     self.questions.ask_again(name, turn + QUERY_EVERY);
                 }
@@ -127,6 +143,17 @@ impl Names {
         }
     }
 
+    /// Asks all routers for names that the store does not have, or did not tell in time, if somebody here waits for
+    /// them.
+    pub(crate) fn ask_others(&mut self, cx: &mut Context<'_>, names: &[Name]) {
+        let is_unknown = |name: &Name| {
+            self.questions.due(name).is_some() && self.mapping.ask(self.location(cx, name)) == Ask::Everyone
+        };
+        let names: Vec<_> = names.iter().copied().filter(is_unknown).collect();
+        let id = self.questions.next_id();
+        self.pass_on(cx, None, id, 0, &names);
+    }
+
     /// Returns `true` if a question is due.
     pub(crate) fn is_ask_due(&self, now: Instant) -> bool {
         self.questions.is_due(now)
@@ -141,7 +168,7 @@ impl Names {
             Some(record) => match record.asked() {
                 Some(_) if cx.network.links.contains(record.link()) => NameLocation::Answered(record.link()),
                 Some(_) => NameLocation::Unknown,
-                None => NameLocation::Flooded,
+                None => NameLocation::Told,
             },
         }
     }

@@ -26,8 +26,8 @@ use sgc_wire::{Control, Name, NodeId, SignedBody};
 use self::heard::Heard;
 use self::interests::Interests;
 use self::questions::Questions;
-use self::record::{NewRecord, Record};
-pub(crate) use self::record::{RecordEnd, RecordId, RecordKind};
+use self::record::NewRecord;
+pub(crate) use self::record::{Record, RecordEnd, RecordId, RecordKind};
 use self::records::Records;
 pub(crate) use self::withheld::Demand;
 use self::withheld::Withheld;
@@ -86,6 +86,8 @@ pub(crate) struct Admitted {
     pub(crate) kind: RecordKind,
     /// Names whose routes may have changed.
     pub(crate) changed: Vec<Name>,
+    /// Whether another record with other names spoke for one of them before.
+    pub(crate) moved: bool,
 }
 
 /// The consequence of a verified announcement.
@@ -154,6 +156,36 @@ impl Names {
     /// Returns `true` for a name of this node.
     pub(crate) fn is_own(&self, name: &Name) -> bool {
         self.owner(name).is_some_and(|owner| owner.node_id == self.own)
+    }
+
+    /// Returns `true` for a name that a link is interested in, or that a router waits for.
+    pub(crate) fn is_awaited(&self, name: &Name) -> bool {
+        self.interests.is_watched(name) || self.questions.is_open(name)
+    }
+
+    /// Returns `true` if an advertisement or withdrawal of this owner speaks for the name.
+    pub(crate) fn is_announced_by(&self, name: &Name, owner: &NodeId) -> bool {
+        self.records.last(name).is_some_and(|record| record.owner_id() == *owner)
+    }
+
+    /// Returns a record in force.
+    pub(crate) fn record(&self, id: RecordId) -> Option<&Record> {
+        self.records.get(id)
+    }
+
+    /// Returns the advertisement that speaks for a name.
+    pub(crate) fn record_of(&self, name: &Name) -> Option<&Record> {
+        self.records.of_name(name)
+    }
+
+    /// Returns the names that a record still speaks for.
+    pub(crate) fn live_names(&self, id: RecordId) -> Vec<Name> {
+        self.records.live_names(id)
+    }
+
+    /// Iterates over the records of some owners.
+    pub(crate) fn records_of(&self, is_wanted: impl Fn(&NodeId) -> bool) -> impl Iterator<Item = RecordId> {
+        self.records.of_owners(is_wanted)
     }
 
     /// Returns `true` if routers are told of names that they did not ask for.
@@ -253,8 +285,12 @@ impl Names {
             (RecordKind::Advert, Err(why)) => return Admission::Ended(why),
         };
         // Owners announce changes unasked.
-        let is_answer =
-            kind == RecordKind::Advert && from.is_router && news.iter().any(|n| self.questions.is_open(n));
+        let is_answer = kind == RecordKind::Advert
+            && from.is_router
+            && link != LinkId::STORE
+            && news.iter().any(|n| self.questions.is_open(n));
+        let moved =
+            news.iter().any(|n| self.records.last_names(n).is_some_and(|names| *names != advert.names));
         let record = NewRecord {
             owner: Arc::new(advert.owner),
             seq: advert.body.seq,
@@ -274,7 +310,7 @@ impl Names {
         };
         let id = self.insert(now.instant, record, &news);
         let changed = if kind == RecordKind::Withdrawal { known } else { news };
-        Admission::Admitted(Admitted { id, owner, kind, changed })
+        Admission::Admitted(Admitted { id, owner, kind, changed, moved })
     }
 
     /// Returns the names of a verified announcement that it has news of. Without any, whatever has to be said is said.

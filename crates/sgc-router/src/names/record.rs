@@ -49,7 +49,7 @@ pub(super) struct NewRecord {
 
 /// A record in force.
 #[derive(Debug)]
-pub(super) struct Record {
+pub(crate) struct Record {
     announced: NewRecord,
     /// Names that no newer one speaks for.
     live: usize,
@@ -67,7 +67,7 @@ impl Record {
     }
 
     /// Returns the id of the owner.
-    pub(super) fn owner_id(&self) -> NodeId {
+    pub(crate) fn owner_id(&self) -> NodeId {
         self.announced.owner.node_id
     }
 
@@ -77,7 +77,7 @@ impl Record {
     }
 
     /// Returns its kind.
-    pub(super) fn kind(&self) -> RecordKind {
+    pub(crate) fn kind(&self) -> RecordKind {
         self.announced.kind
     }
 
@@ -87,12 +87,12 @@ impl Record {
     }
 
     /// Returns its names, also those that a newer one speaks for.
-    pub(super) fn names(&self) -> &[Name] {
+    pub(crate) fn names(&self) -> &[Name] {
         &self.announced.names
     }
 
     /// Returns it as its owner signed it.
-    pub(super) fn signed(&self) -> &SignedBody {
+    pub(crate) fn signed(&self) -> &SignedBody {
         &self.announced.signed
     }
 
@@ -102,7 +102,7 @@ impl Record {
     }
 
     /// Returns the end of its lease.
-    pub(super) fn expires(&self) -> Instant {
+    pub(crate) fn expires(&self) -> Instant {
         self.announced.expires
     }
 
@@ -217,7 +217,7 @@ impl OwnerRecords {
     }
 
     /// Returns the number of names that its advertisements speak for.
-    pub(super) fn names(&self) -> usize {
+    pub(crate) fn names(&self) -> usize {
         self.names
     }
 
@@ -234,6 +234,11 @@ impl OwnerRecords {
     /// Iterates over its advertisements, by sequence number.
     pub(super) fn adverts(&self) -> impl Iterator<Item = RecordId> {
         self.adverts.iter().map(|(_, id)| *id)
+    }
+
+    /// Iterates over its advertisements and withdrawals.
+    pub(super) fn ids(&self) -> impl Iterator<Item = RecordId> {
+        self.adverts.iter().chain(&self.withdrawals).map(|(_, id)| *id)
     }
 
     /// Iterates over its advertisements with numbers below `floor`.

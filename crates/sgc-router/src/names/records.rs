@@ -54,7 +54,7 @@ impl Records {
             withdrawn: 0,
             most_withdrawn: BTreeSet::new(),
             waiting: BTreeMap::new(),
-            over_link: BTreeMap::from([(LinkId::LOCAL, 0)]),
+            over_link: BTreeMap::from([(LinkId::LOCAL, 0), (LinkId::STORE, 0)]),
         }
     }
 
@@ -103,9 +103,19 @@ impl Records {
         run.max(self.memory.floor(owner))
     }
 
+    /// Returns the newest record of a name, an advertisement or a withdrawal.
+    pub(super) fn last(&self, name: &Name) -> Option<&Record> {
+        self.records.get(self.words.get(name)?)
+    }
+
+    /// Returns the names of the newest record of a name.
+    pub(super) fn last_names(&self, name: &Name) -> Option<&[Name]> {
+        self.last(name).map(Record::names)
+    }
+
     /// Returns the newest known sequence number of a name, withdrawn or not.
     pub(super) fn known_seq(&self, name: &Name) -> Option<u64> {
-        self.records.get(self.words.get(name)?).map(Record::seq)
+        self.last(name).map(Record::seq)
     }
 
     /// Returns the last message of an owner, in force or not, and its number.
@@ -118,6 +128,12 @@ impl Records {
     /// Iterates over the owners of records.
     pub(super) fn owners(&self) -> impl Iterator<Item = &NodeId> {
         self.owners.keys()
+    }
+
+    /// Iterates over the records of some owners.
+    pub(super) fn of_owners(&self, is_wanted: impl Fn(&NodeId) -> bool) -> impl Iterator<Item = RecordId> {
+        let owners = self.owners.iter().filter(move |(owner, _)| is_wanted(owner));
+        owners.flat_map(|(_, of_owner)| of_owner.ids())
     }
 
     /// Iterates over the advertisements.

@@ -54,6 +54,7 @@ impl Bench {
             network: Network { links: &self.links, topology: &self.topology },
             allowances: &mut self.allowances,
             outputs: &mut self.outputs,
+            store: None,
         };
         handle(&mut self.names, &mut cx)
     }

@@ -21,7 +21,7 @@ impl Router {
     // ---- Names.
 
     pub(super) fn handle_advert(&mut self, link: LinkId, cost: u32, signed: SignedBody) {
-        let Some(from) = self.links.peer(link) else { return };
+        let Some(from) = self.bringer(link) else { return };
         let now = self.now;
         let digest = signed_digest(&signed);
         match self.names.recognise(&digest) {
@@ -54,7 +54,8 @@ impl Router {
 
     /// Passes on a record that was just put into force, and lets everything else follow it.
     fn pass_on_record(&mut self, link: LinkId, cost: u32, admitted: Admitted) {
-        let Admitted { id, owner, kind, mut changed } = admitted;
+        let Admitted { id, owner, kind, mut changed, moved } = admitted;
+        self.store_record(&owner, id, moved);
         match kind {
             RecordKind::Advert => {
                 // A node that only listens may learn of known names from another neighbour.
@@ -115,7 +116,7 @@ impl Router {
     // ---- Link states.
 
     pub(super) fn handle_link_state(&mut self, link: LinkId, signed: SignedBody) {
-        let Some(from) = self.links.remote_peer(link) else { return };
+        let Some(from) = self.bringer(link).filter(|_| link != LinkId::LOCAL) else { return };
         let now = self.now;
         let digest = signed_digest(&signed);
         match self.topology.recognise(&digest) {
@@ -148,6 +149,7 @@ impl Router {
                     self.supersede_runs_before(&node, floor);
                 }
                 self.pass_on_node_or_wait(link, &node);
+                self.store_link_state(&node);
             }
         }
     }

@@ -7,6 +7,7 @@ mod announcements;
 mod branches;
 mod lists;
 mod neighbours;
+mod store;
 mod sync;
 mod trust;
 
@@ -24,9 +25,11 @@ use crate::drops::DropReason;
 use crate::limits::allowances::Allowances;
 use crate::link_id::LinkId;
 use crate::links::{DirectReach, Link, LinkQuality, Links, Neighbour, PathKind};
+use crate::mapping::MappingKind;
 use crate::names::Names;
 use crate::network::Network;
 use crate::output::{LinkClose, Output, Outputs};
+use crate::store::Store;
 use crate::topology::{RouteStats, Topology};
 use crate::trees::Trees;
 
@@ -65,6 +68,8 @@ pub struct Router {
     trees: Trees,
     syncs: Syncs,
     lists: ListAllowances,
+    /// The store of names, at a router that has one.
+    store: Option<Store>,
     outputs: Outputs,
     /// Time at which to pass on announcements beyond the allowance of their signer.
     late_at: Option<Instant>,
@@ -92,6 +97,8 @@ impl Router {
             trees: Trees::new(&config.limits),
             syncs: Syncs::default(),
             lists: ListAllowances::default(),
+            store: (config.transit && config.mapping == MappingKind::Store)
+                .then(|| Store::new(config.limits.store_cache_bytes)),
             outputs: Outputs::default(),
             late_at: None,
             claim: Claim::TakesOver,
@@ -215,6 +222,9 @@ impl Router {
         self.pass_on_late();
         self.take_waiting_lists();
         self.names_part(Names::release_withheld);
+        if let Some(store) = &mut self.store {
+            store.handle_timeout(now.instant);
+        }
         let effects = self.trees.handle_timeout(now.instant);
         self.perform(effects);
     }
@@ -230,11 +240,13 @@ impl Router {
             if self.names.is_ask_due(now) {
                 self.names_part(Names::ask_due);
             }
+            self.follow_store();
         }
         self.outputs.pop().unwrap_or_else(|| {
             let deadlines =
                 [self.trees.next_deadline(), self.links.next_expiry(), self.late_at, self.lists.next_at()];
-            let parts = self.topology.deadlines().chain(self.names.deadlines());
+            let store = self.store.iter().flat_map(Store::deadlines);
+            let parts = self.topology.deadlines().chain(self.names.deadlines()).chain(store);
             Output::Timeout(deadlines.into_iter().flatten().chain(parts).min())
         })
     }
@@ -336,6 +348,7 @@ impl Router {
             network: Network { links: &self.links, topology: &self.topology },
             allowances: &mut self.allowances,
             outputs: &mut self.outputs,
+            store: self.store.as_mut(),
         };
         handle(&mut self.names, &mut cx)
     }

@@ -33,6 +33,11 @@ impl NodeRecord {
         &self.signed
     }
 
+    /// Returns the end of its lease.
+    pub(crate) fn expires(&self) -> Instant {
+        self.expires
+    }
+
     /// Returns the time of its signing.
     pub(crate) fn issued_at(&self) -> UnixMillis {
         self.issued_at

@@ -21,6 +21,7 @@ use sgc_endpoint::{
 };
 use sgc_router::{
     DirectReach, FibEntry, LinkClose, LinkId, LinkQuality, MappingKind, Neighbour, Router, RouterConfig,
+    StoreEvent, StoreOp,
 };
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
@@ -149,6 +150,8 @@ pub(crate) enum Arrival {
     Observed(LinkId, SocketAddr),
     /// The peer of a direct path did not answer when it was dialled.
     NotDialled(NodeId),
+    /// News from the store.
+    Store(StoreEvent),
 }
 
 /// An action that the world carries out for a node.
@@ -167,6 +170,8 @@ pub(crate) enum Effect {
     Dial(NodeId, SocketAddr),
     /// Find out the addresses of this node.
     Look,
+    /// Carry out an operation of the store.
+    Store(StoreOp),
     /// A message was delivered.
     Delivered { owner: NodeKey, topic: String, id: MessageId, use_number: u64 },
     /// Keep its trust anchors over restarts.
@@ -364,6 +369,7 @@ impl Running {
                     direct.observe(now.instant, link, address);
                 }
             }
+            Arrival::Store(event) => self.router.handle_store(now, event),
             Arrival::NotDialled(peer) => {
                 if let Some(direct) = &mut self.direct {
                     direct.paths.not_dialled(now.instant, peer);
@@ -551,6 +557,7 @@ impl Running {
                     self.effects.push(Effect::Close(link, reason));
                 }
                 sgc_router::Output::Flush { link } => self.router.handle_flushed(now, link),
+                sgc_router::Output::Store(op) => self.effects.push(Effect::Store(op)),
                 sgc_router::Output::Trust(anchors) => {
                     self.anchors = anchors.clone();
                     self.effects.push(Effect::Trust(anchors.clone()));

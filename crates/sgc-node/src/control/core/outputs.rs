@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Event, Output as EndpointOutput};
 use sgc_ros::{RosNetwork, Routes, UNREACHABLE_HOLD};
-use sgc_router::{DropReason, LinkClose, LinkId, Output as RouterOutput};
+use sgc_router::{DropReason, LinkClose, LinkId, Output as RouterOutput, StoreEvent, StoreFailure};
 use sgc_transport::CloseReason;
 use sgc_wire::{Name, Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
@@ -47,6 +47,11 @@ impl<N: RosNetwork> Core<N> {
                 } else {
                     debug!(link = %dropped.link, reason = %dropped.reason, "control frame refused");
                 }
+            }
+            // This node reaches no store.
+            RouterOutput::Store(operation) => {
+                let result = Err(StoreFailure::Unreachable);
+                self.router.handle_store(now(), StoreEvent::Reply { id: operation.id, result });
             }
             RouterOutput::Timeout(_) => {}
         }
