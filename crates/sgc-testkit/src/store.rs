@@ -193,6 +193,12 @@ impl World {
         }
     }
 
+    /// Has the store lose the value of a key, without telling its readers.
+    pub fn forget_stored(&mut self, key: &StoreKey) {
+        self.note(format!("the store forgets {key}"));
+        self.store.set(*key, None);
+    }
+
     /// Returns the number of values in the store.
     pub fn stored(&self) -> usize {
         self.store.values.len()

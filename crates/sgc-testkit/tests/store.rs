@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sgc_router::{MappingKind, StoreKey};
 
-use sgc_testkit::{NodeKey, Sharing, StoreCounts, World, WorldConfig};
+use sgc_testkit::{Dice, NodeKey, Sharing, StoreCounts, What, World, WorldConfig};
 use sgc_wire::Control;
 
 const fn ms(n: u64) -> Duration {
@@ -83,4 +83,195 @@ fn name_is_found_through_the_store_without_a_question_to_a_router() {
     site.assert_delivers("/chatter");
     assert_eq!(site.questions(site.routers[0]), 0);
     assert!(site.world.store_stats(site.routers[1]).found > 0);
+}
+
+#[test]
+fn renewals_write_each_batch_once_and_no_name() {
+    let mut site = Site::new();
+    site.until_granted("/chatter");
+    // The catalogue and the topic were advertised one after the other, and are renewed together.
+    site.world.run(Duration::from_secs(110));
+    let renewed = site.counts_of(|site| site.world.run(Duration::from_secs(100)));
+    assert_eq!((renewed.writes, renewed.name_writes), (4, 0), "a batch and a link state of each node");
+    assert_eq!(renewed.reads, 2, "the desk's router reads them again, because the desk uses the topic");
+    site.world.run(Duration::from_secs(400));
+    site.assert_delivers("/chatter");
+}
+
+#[test]
+fn robot_that_roams_rewrites_no_name() {
+    let mut site = Site::new();
+    let third = site.world.router("third");
+    site.world.link(third, site.routers[1]);
+    site.until_granted("/chatter");
+    site.world.run(Duration::from_secs(220));
+    let roamed = site.counts_of(|site| {
+        site.world.cut(site.routers[0], site.robot);
+        site.world.link(third, site.robot);
+        site.world.run(Duration::from_secs(5));
+    });
+    assert_eq!(roamed.name_writes, 0);
+    assert!((1..=4).contains(&roamed.writes), "its link state as it changes, and its batches: {roamed:?}");
+    site.assert_delivers("/chatter");
+    assert_eq!(site.world.next_hop(site.routers[1], &site.world.name(site.robot, "/chatter")), Some(third));
+}
+
+#[test]
+fn lost_store_ends_no_flow_and_routers_find_new_names_by_asking() {
+    let mut site = Site::new();
+    let second_desk = site.world.proxy("second-desk");
+    site.world.link(site.routers[1], second_desk);
+    site.until_granted("/chatter");
+    site.world.stop_store();
+    site.world.run(Duration::from_secs(3));
+    site.assert_delivers("/chatter");
+    let known = site.counts_of(|site| {
+        site.world.use_topic(second_desk, site.robot, "/chatter");
+        site.world.until_granted(second_desk, site.robot, "/chatter");
+    });
+    assert_eq!(known, StoreCounts::default(), "the name is known");
+    site.world.share(site.robot, "/new", Sharing::to_fleet());
+    let took = site.until_granted("/new");
+    assert!(took < Duration::from_secs(1), "routers are asked at once: {took:?}");
+    site.world.run(Duration::from_secs(600));
+    site.assert_delivers("/chatter");
+    site.assert_delivers("/new");
+}
+
+#[test]
+fn store_that_returns_empty_is_filled_again() {
+    let mut site = Site::new();
+    site.until_granted("/chatter");
+    site.world.run(Duration::from_secs(1));
+    let before = site.world.stored();
+    site.world.stop_store();
+    site.world.run(Duration::from_secs(30));
+    site.world.start_store(false);
+    site.world.run(Duration::from_secs(2));
+    assert_eq!(site.world.stored(), before);
+    // Another router has no other source than the store.
+    let (third, late_desk) = (site.world.router("third"), site.world.proxy("late-desk"));
+    site.world.link(third, site.routers[1]);
+    site.world.link(third, late_desk);
+    site.world.run(Duration::from_secs(1));
+    site.world.capture();
+    site.world.use_topic(late_desk, site.robot, "/chatter");
+    site.world.until_granted(late_desk, site.robot, "/chatter");
+    assert_eq!(site.questions(site.routers[0]) + site.questions(site.routers[1]), 0);
+}
+
+#[test]
+fn names_that_the_store_lost_are_found_by_asking_and_written_again() {
+    let mut site = Site::new();
+    let name = StoreKey::Name(site.world.name(site.robot, "/chatter"));
+    assert!(site.world.stored_value(&name).is_some());
+    site.world.forget_stored(&name);
+    site.until_granted("/chatter");
+    site.world.run(Duration::from_secs(1));
+    assert!(site.world.stored_value(&name).is_some());
+    assert_eq!(site.world.store_stats(site.routers[0]).healed, 1);
+}
+
+#[test]
+fn withdrawn_name_ends_and_can_be_shared_again() {
+    let mut site = Site::new();
+    site.world.share(site.robot, "/kept", Sharing::to_fleet());
+    site.until_granted("/chatter");
+    site.until_granted("/kept");
+    // Both are in one batch from here on.
+    site.world.run(Duration::from_secs(110));
+    site.world.unshare(site.robot, "/chatter");
+    site.world.run(Duration::from_secs(30));
+    assert_eq!(site.world.granted(site.robot, "/chatter"), []);
+    let name = site.world.name(site.robot, "/chatter");
+    assert_eq!(site.world.next_hop(site.routers[1], &name), None);
+    site.world.share(site.robot, "/chatter", Sharing::to_fleet());
+    site.world.until_granted(site.desk, site.robot, "/chatter");
+    site.assert_delivers("/chatter");
+    site.assert_delivers("/kept");
+}
+
+#[test]
+fn name_of_a_node_that_is_gone_leaves_the_store_when_it_is_looked_up() {
+    let mut site = Site::new();
+    site.world.crash(site.robot);
+    site.world.run(Duration::from_secs(310));
+    site.world.use_topic(site.desk, site.robot, "/chatter");
+    site.world.run(Duration::from_secs(30));
+    // The desk asks for topics once it has the catalogue.
+    let catalogue = StoreKey::Name(site.world.catalogue_name(site.robot));
+    assert_eq!(site.world.stored_value(&catalogue), None);
+    assert_eq!(site.world.store_stats(site.routers[1]).orphans, 1);
+    site.world.start(site.robot);
+    site.world.until_granted(site.desk, site.robot, "/chatter");
+    site.assert_delivers("/chatter");
+}
+
+#[test]
+fn nodes_that_want_one_name_cause_one_look_up() {
+    let mut site = Site::new();
+    let desks: Vec<_> = (0..20).map(|n| site.world.proxy(&format!("desk-{n}"))).collect();
+    for desk in &desks {
+        site.world.link(site.routers[1], *desk);
+    }
+    site.world.run(Duration::from_secs(3));
+    let one = site.counts_of(|site| {
+        site.until_granted("/chatter");
+    });
+    let more = site.counts_of(|site| {
+        for desk in &desks {
+            site.world.use_topic(*desk, site.robot, "/chatter");
+        }
+        site.world.run(Duration::from_secs(2));
+    });
+    assert_eq!(site.world.granted(site.robot, "/chatter").len(), 21);
+    assert_eq!((one.writes, more.reads, more.writes), (0, 0, 0));
+}
+
+#[test]
+fn store_works_beside_other_mappings_in_one_mesh() {
+    let (flood, query, store) = (MappingKind::Flood, MappingKind::Query, MappingKind::Store);
+    for mappings in [[store, query], [query, store], [store, flood], [flood, store]] {
+        let mut site = Site::with(mappings);
+        let took = site.until_granted("/chatter");
+        assert!(took < Duration::from_secs(1), "{mappings:?}: {took:?}");
+        site.assert_delivers("/chatter");
+    }
+}
+
+#[test]
+fn question_of_a_router_without_the_store_is_answered_from_it() {
+    let mut site = Site::new();
+    // The router that asks is linked to one that does not know the name, and nobody else.
+    site.world.set_mapping(MappingKind::Query);
+    let (far, far_desk) = (site.world.router("far"), site.world.proxy("far-desk"));
+    site.world.link(far, site.routers[1]);
+    site.world.link(far, far_desk);
+    let [first, second] = site.routers;
+    let is_question = |frame: &Control| matches!(frame, Control::Query { .. });
+    site.world
+        .tamper(second, first, move |f| Some(f.clone()).filter(|f| !is_question(f)).into_iter().collect());
+    site.world.run(Duration::from_secs(1));
+    site.world.use_topic(far_desk, site.robot, "/chatter");
+    site.world.until_granted(far_desk, site.robot, "/chatter");
+}
+
+#[test]
+fn lying_store_delays_names_and_nothing_else() {
+    for seed in 0..40 {
+        let mut site = Site::new();
+        let mut dice = Dice::new(seed);
+        site.until_granted("/chatter");
+        site.world.share(site.robot, "/new", Sharing::to_fleet());
+        site.world.run(ms(500));
+        for _ in 0..10 {
+            site.world.corrupt_store(&mut dice);
+            site.world.run(ms(200));
+        }
+        site.assert_delivers("/chatter");
+        let took = site.until_granted("/new");
+        assert!(took < Duration::from_secs(25), "seed {seed}: {took:?}");
+        site.assert_delivers("/new");
+        assert!(site.world.log().iter().all(|entry| !matches!(entry.what, What::Closed { .. })));
+    }
 }
