@@ -4,13 +4,15 @@
 //! [`Model`], within a bound. Then messages are published and must reach exactly the granted nodes.
 //! In the second test, proxies are behind NATs. Pairs that exchange data have a direct link at rest if and only if theory
 //! allows one, and no source sends a message over a direct link through its uplink beside another copy.
+//! In the third test, routers share a store that stops, forgets and lies. Once it answers and lies no more, all must be as
+//! without one.
 //! `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and lists failures.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use sgc_endpoint::SinkDrop;
-use sgc_router::{DropReason, MappingKind};
+use sgc_router::{DropReason, LinkId, MappingKind};
 use sgc_testkit::{
     DataDrop, Dice, Member, MessageId, Model, NatKey, NatKind, NodeKey, Sharing, What, World, WorldConfig,
     revocation_list, run_seeds,
@@ -28,6 +30,8 @@ const COMMITTED_NATS: &[u64] = &[
     306, 436, 533, 572, 593, 652, 2049, 2277, 2529, 2909, 10350, // showed bugs
     1497, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20,
 ];
+/// The same for routers that share a store.
+const COMMITTED_STORE: &[u64] = &[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20];
 /// Longest time from the last transition until all is as it should be: a lease, for what was not believed while a clock
 /// was wrong or not heard of during a partition. All else takes seconds.
 const QUIET_MAX: Duration = Duration::from_secs(330);
@@ -68,6 +72,11 @@ enum Transition {
     Share(NodeKey, &'static str, Sharing),
     ShutDown(NodeKey),
     Start(NodeKey),
+    /// The store loses, replays, swaps or invents values.
+    StoreLies,
+    /// The store returns, with its values or without.
+    StoreStarts(bool),
+    StoreStops,
     StopUsing(NodeKey, NodeKey, &'static str),
     Unshare(NodeKey, &'static str),
     Use(NodeKey, NodeKey, &'static str),
@@ -104,6 +113,8 @@ struct Run {
     slowest: Duration,
     /// Networks with NATs: what is drawn for them, so that the others keep their histories.
     hosts: Option<Hosts>,
+    /// Networks with a store: the draws for it.
+    store: Option<Dice>,
 }
 
 /// The hosts and NATs of a run.
@@ -208,13 +219,29 @@ impl Run {
         run
     }
 
+    /// Returns a run in which all routers, or some, share a store.
+    fn with_store(seed: u64) -> Self {
+        let mut dice = Dice::new(seed ^ 0x570e_570e);
+        let (flood, query, store) = (MappingKind::Flood, MappingKind::Query, MappingKind::Store);
+        let mappings = [vec![store], vec![store, query], vec![store, flood], vec![store, flood, query]];
+        let mut run = Self::with_mappings(seed, Some(mappings[dice.below(4)].clone()));
+        run.store = Some(dice);
+        run
+    }
+
     fn new(seed: u64) -> Self {
+        Self::with_mappings(seed, None)
+    }
+
+    /// Returns a run whose routers draw one of these mappings, or of others.
+    fn with_mappings(seed: u64, mappings: Option<Vec<MappingKind>>) -> Self {
         let mut dice = Dice::new(seed);
         let mut config = WorldConfig::new(dice.number());
         config.seed = seed;
         config.jitter = Duration::ZERO..=ms([0, 3, 50][dice.below(3)]);
         let (flood, query) = (MappingKind::Flood, MappingKind::Query);
         config.mappings = [vec![flood], vec![query], vec![flood, query]][dice.below(3)].clone();
+        config.mappings = mappings.unwrap_or(config.mappings);
         config.repeat_percent = [0, 10][dice.below(2)];
         let mut world = World::with(config);
         let mut members = Vec::new();
@@ -274,6 +301,7 @@ impl Run {
             clocks: false,
             slowest: Duration::ZERO,
             hosts: None,
+            store: None,
         }
     }
 
@@ -284,6 +312,17 @@ impl Run {
         {
             let shared: Vec<_> = self.shared.keys().copied().collect();
             return hosts.draw(&mut self.world, &shared);
+        }
+        if let Some(dice) = &mut self.store
+            && dice.chance(20)
+        {
+            let is_down = self.world.is_store_down();
+            return Some(match dice.below(4) {
+                0 | 1 if is_down => Transition::StoreStarts(dice.chance(50)),
+                0 => Transition::StoreStops,
+                _ if is_down => return None,
+                _ => Transition::StoreLies,
+            });
         }
         let dice = &mut self.dice;
         let world = &self.world;
@@ -413,6 +452,13 @@ impl Run {
             }
             Transition::ShutDown(n) => world.shut_down(n),
             Transition::Start(n) => world.start(n),
+            Transition::StoreLies => {
+                if let Some(dice) = &mut self.store {
+                    world.corrupt_store(dice);
+                }
+            }
+            Transition::StoreStarts(keeps_values) => world.start_store(keeps_values),
+            Transition::StoreStops => world.stop_store(),
             Transition::StopUsing(n, owner, topic) => world.stop_using(n, owner, topic),
             Transition::Unshare(n, topic) => {
                 self.shared.remove(&(n, topic));
@@ -670,7 +716,8 @@ impl Run {
                         // Nodes that do not know of it yet pass it on.
                         | DropReason::NotVerified { why: SignedError::Cert(CertError::Revoked { .. }), .. }
                     ) || match &dropped.reason {
-                        DropReason::Clock { .. } => self.clocks,
+                        DropReason::Clock { .. } => self.clocks || dropped.link == LinkId::STORE,
+                        DropReason::NotVerified { .. } => dropped.link == LinkId::STORE,
                         _ => false,
                     }
                 }
@@ -741,6 +788,20 @@ fn random_networks_become_what_the_model_says() {
         |run| run.world.trace(),
     );
     eprintln!("slowest to become quiet: {:?}", took.into_iter().max().unwrap_or_default());
+}
+
+#[test]
+fn random_networks_with_a_store_become_what_the_model_says() {
+    let slowest = run_seeds(
+        COMMITTED_STORE,
+        Run::with_store,
+        |run| {
+            run.all();
+            run.slowest
+        },
+        |run| run.world.trace(),
+    );
+    eprintln!("slowest to become quiet: {:?}", slowest.into_iter().max().unwrap_or_default());
 }
 
 #[test]
