@@ -1,25 +1,27 @@
 //! The store of names that routers share: a client of Valkey and Redis, as a cluster or a single server.
+//!
+//! [`run`] carries out the operations of the router's mapping `store`. The servers are not trusted: whatever they send
+//! costs bounded memory and time, and values are the router's to verify. [`check`] says whether a store fits.
+//!
+//! `resp` reads and writes the protocol, `cluster` is the machine that decides, and `link` and `driver` do the IO. The
+//! crate knows nothing about names and their owners; `sgc-router` does.
 #![forbid(unsafe_code)]
 
+mod cluster;
+mod command;
 mod config;
-
-use sgc_router::{StoreEvent, StoreFailure, StoreOp};
-use tokio::sync::mpsc;
+mod driver;
+mod key;
+mod link;
+mod resp;
+mod topology;
 
 pub use config::{
     PORT_DEFAULT, PREFIX_BYTES_MAX, SERVERS_MAX, StoreConfig, StoreConfigError, StorePrefix,
     StorePrefixError, StoreServer, StoreServerError, StoreTls, StoreTlsError, StoreUser, StoreUserError,
 };
 
-/// Carries operations out until `ops` is closed.
-pub async fn run(_config: StoreConfig, mut ops: mpsc::Receiver<StoreOp>, events: mpsc::Sender<StoreEvent>) {
-    while let Some(op) = ops.recv().await {
-        let reply = StoreEvent::Reply { id: op.id, result: Err(StoreFailure::Unreachable) };
-        if events.send(reply).await.is_err() {
-            return;
-        }
-    }
-}
+pub use driver::run;
 
 /// Says whether a store fits.
 pub async fn check(_config: StoreConfig) -> StoreReport {
