@@ -42,6 +42,7 @@ mod networks;
 mod node;
 mod ports;
 mod record;
+pub mod redis;
 mod rng;
 mod ros;
 mod seeds;
