@@ -9,8 +9,8 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use crate::draft::{
-    AuditDraft, Draft, GatewayDraft, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft,
-    WithOrigin, Words,
+    AuditDraft, Draft, GatewayDraft, RosDraft, RotationDraft, ShareDraft, StoreDraft, TransportDraft,
+    UseDraft, WithOrigin, Words,
 };
 use crate::error::{ConfigError, Mistake, Origin};
 use crate::schema::nearest;
@@ -114,6 +114,7 @@ pub(crate) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         listen: all("--listen", &args.listen),
         peer_rate: None,
         mapping: None,
+        store: StoreDraft::default(),
         announce: args.announce.then(|| located("--announce", true)),
         accept: (!args.accept.is_empty()).then(|| {
             let files = args.accept.iter().map(|file| file.to_string_lossy().into_owned());

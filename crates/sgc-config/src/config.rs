@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use sgc_ros::{Interface, Naming, QosOverride, Shaping};
 use sgc_router::MappingKind;
+use sgc_store::{StorePrefix, StoreServer};
 use sgc_transport::{Congestion, ListenAddr};
 use sgc_trust::{FleetName, NodeName, OBSERVERS_GROUP, ShareToken, Suite};
 use sgc_wire::{Class, NodeId};
@@ -24,6 +25,21 @@ pub const KEEP_ALIVE_MAX: Duration = Duration::from_secs(60);
 pub const PEER_RATE_MIN: u64 = 64_000;
 /// The highest rate of a peer, in bits a second: more than any network carries.
 pub const PEER_RATE_MAX: u64 = 1_000_000_000_000;
+
+/// The store in which a router keeps names.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StoreSettings {
+    /// Servers of the store; those of a cluster name the others.
+    pub servers: Vec<StoreServer>,
+    /// Beginning of all keys.
+    pub prefix: StorePrefix,
+    /// User of the store's ACL, and the file of its password.
+    pub user: Option<(String, PathBuf)>,
+    /// File with the CAs that vouch for servers with TLS; `None` means the system's.
+    pub ca: Option<PathBuf>,
+    /// Files with the certificate chain that is shown to servers with TLS, and its key.
+    pub certificate: Option<(PathBuf, PathBuf)>,
+}
 
 /// A node's configuration, valid in itself.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -45,6 +61,8 @@ pub struct Config {
     pub peer_rate: Option<u64>,
     /// Mapping by which this router learns owners of names.
     pub mapping: MappingKind,
+    /// The store of this router, with [`MappingKind::Store`].
+    pub store: Option<StoreSettings>,
     /// Whether the router announces itself on the local network.
     pub announce: bool,
     /// Files with the CAs whose nodes may attach; if empty, all trusted CAs.

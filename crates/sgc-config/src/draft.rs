@@ -57,6 +57,7 @@ pub(crate) struct Draft {
     pub(crate) listen: Vec<WithOrigin<String>>,
     pub(crate) peer_rate: Option<WithOrigin<String>>,
     pub(crate) mapping: Option<WithOrigin<String>>,
+    pub(crate) store: StoreDraft,
     pub(crate) announce: Option<WithOrigin<bool>>,
     /// The list has an origin of its own, since an empty one is a mistake.
     pub(crate) accept: Option<WithOrigin<Vec<WithOrigin<String>>>>,
@@ -206,6 +207,18 @@ pub(crate) struct TransportDraft {
     pub(crate) dtls_1_2: Option<WithOrigin<bool>>,
     pub(crate) dscp: Option<WithOrigin<String>>,
     pub(crate) lane_dscp: Option<WithOrigin<String>>,
+}
+
+/// The store of `[router]`.
+#[derive(Debug, Default)]
+pub(crate) struct StoreDraft {
+    pub(crate) servers: Vec<WithOrigin<String>>,
+    pub(crate) prefix: Option<WithOrigin<String>>,
+    pub(crate) user: Option<WithOrigin<String>>,
+    pub(crate) password_file: Option<WithOrigin<PathBuf>>,
+    pub(crate) ca: Option<WithOrigin<PathBuf>>,
+    pub(crate) certificate: Option<WithOrigin<PathBuf>>,
+    pub(crate) key: Option<WithOrigin<PathBuf>>,
 }
 
 /// `[metrics]`.

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use sgc_gateway::{PageOriginError, ScopeError};
+use sgc_store::{StorePrefixError, StoreServerError};
 use sgc_transport::UrlError;
 use sgc_trust::{CertificateNameError, TokenError};
 
@@ -562,6 +563,55 @@ pub enum Mistake {
     OtlpCaUnused {
         /// The key.
         key: &'static str,
+    },
+    /// The URL of a server of a store is wrong.
+    #[error("`{key}`: {fault}")]
+    StoreServer {
+        /// The key.
+        key: &'static str,
+        /// The fault.
+        fault: StoreServerError,
+    },
+    /// The prefix of the keys in a store is wrong.
+    #[error("`{key}`: {fault}")]
+    StorePrefix {
+        /// The key.
+        key: &'static str,
+        /// The fault.
+        fault: StorePrefixError,
+    },
+    /// The mapping `store` without a store.
+    #[error(
+        "`mapping` is \"store\", and `store` does not say where: add it, such as store = [\"valkey://store.example:6379\"]"
+    )]
+    StoreMissing,
+    /// A setting of a store at a router that uses none.
+    #[error("`{key}` is for a store of names: add mapping = \"store\", or take `{key}` out")]
+    StoreUnused {
+        /// The key.
+        key: &'static str,
+    },
+    /// Servers with and without TLS.
+    #[error(
+        "`{key}` has servers with TLS (valkeys://) and without (valkey://): the password would go unencrypted"
+    )]
+    StoreMixed {
+        /// The key.
+        key: &'static str,
+    },
+    /// Files for TLS at a store without it.
+    #[error("`{key}` is for valkeys://, and `store` begins with valkey://: correct one of them")]
+    StoreTlsUnused {
+        /// The key.
+        key: &'static str,
+    },
+    /// One of two settings that belong together.
+    #[error("`{key}` needs `{missing}` beside it: add that, or take `{key}` out")]
+    StoreHalf {
+        /// The key.
+        key: &'static str,
+        /// The other key.
+        missing: &'static str,
     },
     /// A file with headers is invalid.
     #[error("`{key}` names {}: {reason}", path.display())]

@@ -13,7 +13,8 @@ use toml::de::{DeTable, DeValue};
 
 use crate::draft::{
     AuditDraft, Draft, GatewayClientDraft, GatewayDraft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft,
-    RosDraft, RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, WithOrigin, Words,
+    RosDraft, RotationDraft, ShapingDraft, ShareDraft, StoreDraft, TransportDraft, UseDraft, WithOrigin,
+    Words,
 };
 use crate::error::{ConfigError, Mistake, Origin};
 use crate::schema::{Table, nearest};
@@ -110,7 +111,8 @@ impl FileReader<'_> {
                 "an array of strings, such as [\"quic://0.0.0.0:7447\"]",
             ),
             peer_rate: self.string(router.as_ref(), "peer_rate", "a string, such as \"50Mbps\""),
-            mapping: self.string(router.as_ref(), "mapping", "\"flood\" or \"query\""),
+            mapping: self.string(router.as_ref(), "mapping", "\"flood\", \"query\" or \"store\""),
+            store: self.store(router.as_ref()),
             announce: self.boolean(router.as_ref(), "announce", "true or false"),
             accept: self.strings(
                 router.as_ref(),
@@ -350,6 +352,27 @@ impl FileReader<'_> {
                 .string(partner, "ca", "a string, such as \"acme-ca.pem\"")
                 .map(|ca| ca.map(PathBuf::from)),
             node,
+        }
+    }
+
+    fn store(&mut self, router: Option<&Section<'_, '_>>) -> StoreDraft {
+        let mut file = |key, expected| Some(self.string(router, key, expected)?.map(PathBuf::from));
+        let password_file = file("store_password_file", "a string, such as \"store.password\"");
+        let ca = file("store_ca", "a string, such as \"store-ca.pem\"");
+        let certificate = file("store_certificate", "a string, such as \"router.pem\"");
+        let key = file("store_key", "a string, such as \"router.key\"");
+        StoreDraft {
+            servers: self.flat_strings(
+                router,
+                "store",
+                "an array of strings, such as [\"valkey://store.example:6379\"]",
+            ),
+            prefix: self.string(router, "store_prefix", "a string, such as \"acme\""),
+            user: self.string(router, "store_user", "a string, such as \"router\""),
+            password_file,
+            ca,
+            certificate,
+            key,
         }
     }
 

@@ -29,7 +29,7 @@ pub use args::ArgsConfig;
 pub use config::{
     AuditConfig, AuditRoom, AuthorityConfig, Config, DiscoveryRange, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN,
     PEER_RATE_MAX, PEER_RATE_MIN, PartnerConfig, RosConfig, RotationConfig, SecurityConfig, ShareConfig,
-    ShareMetadata, TokenConfig, TokenSource, TransportConfig, UseConfig,
+    ShareMetadata, StoreSettings, TokenConfig, TokenSource, TransportConfig, UseConfig,
 };
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
 pub use gateway::{

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use sgc_gateway::{PageOrigin, PageOriginError};
 use sgc_ros::{Interface, TOPIC_BYTES_MAX};
+use sgc_store::{StorePrefix, StoreServer};
 use sgc_transport::{ListenAddr, UrlError};
 use sgc_trust::{CertificateName, FleetName, LABEL_BYTES_MAX, NodeName};
 use sgc_wire::NodeId;
@@ -355,6 +356,16 @@ pub(crate) fn otlp(key: &'static str, value: &str) -> Result<OtlpUrl, Mistake> {
         OtlpUrlError::Credentials => Mistake::OtlpCredentials { key },
         fault => Mistake::OtlpUrl { key, value: value.to_owned(), fault },
     })
+}
+
+/// Parses the URL of a server of a store.
+pub(crate) fn store_server(key: &'static str, value: &str) -> Result<StoreServer, Mistake> {
+    value.parse().map_err(|fault| Mistake::StoreServer { key, fault })
+}
+
+/// Checks the prefix of the keys in a store.
+pub(crate) fn store_prefix(key: &'static str, value: &str) -> Result<StorePrefix, Mistake> {
+    value.parse().map_err(|fault| Mistake::StorePrefix { key, fault })
 }
 
 /// Checks a listen address, `SCHEME://ADDRESS[:PORT]`.

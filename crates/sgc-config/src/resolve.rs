@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping, is_enclave, is_pattern, matches};
 use sgc_router::MappingKind;
+use sgc_store::{SERVERS_MAX, StoreServer};
 use sgc_transport::Congestion;
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite, TOKEN_PREFIX};
 use sgc_wire::{
@@ -17,12 +18,12 @@ use sgc_wire::{
 
 use crate::config::{
     AuditConfig, AuditRoom, AuthorityConfig, Config, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig,
-    RosConfig, RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource,
-    TransportConfig, UseConfig,
+    RosConfig, RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, StoreSettings, TokenConfig,
+    TokenSource, TransportConfig, UseConfig,
 };
 use crate::draft::{
-    Draft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft,
-    WithOrigin, Words,
+    Draft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, StoreDraft,
+    UseDraft, WithOrigin, Words,
 };
 use crate::error::{ConfigError, Mistake, Origin};
 use crate::metrics::{MetricsConfig, OtlpConfig};
@@ -132,6 +133,7 @@ pub(crate) fn resolve(
     let accept = resolver.accept(draft);
     let attempted = |key| draft.attempted.contains(key);
     let mapping = draft.mapping.as_ref().and_then(|kind| resolver.keep(kind, mapping)).unwrap_or_default();
+    let store = resolver.store(draft, mapping);
     let peer_rate = draft.peer_rate.as_ref().and_then(|rate| resolver.keep(rate, names::rate));
     let connects = !draft.routers.is_empty() || !draft.listen.is_empty();
     if !connects && !["routers", "listen", "node", "router"].into_iter().any(attempted) {
@@ -176,6 +178,7 @@ pub(crate) fn resolve(
             listen,
             peer_rate,
             mapping,
+            store,
             announce,
             accept,
             ros,
@@ -664,8 +667,8 @@ impl Resolver<'_> {
         let (headers, roots) =
             (self.checks.map(|checks| checks.headers), self.checks.map(|checks| checks.roots));
         let headers_file =
-            self.otlp_file(written.otlp_headers_file.as_ref(), "\"collector.headers\"", headers);
-        let ca = self.otlp_file(written.otlp_ca.as_ref(), "\"collector-ca.pem\"", roots);
+            self.checked_file(written.otlp_headers_file.as_ref(), "\"collector.headers\"", headers);
+        let ca = self.checked_file(written.otlp_ca.as_ref(), "\"collector-ca.pem\"", roots);
         if let (Some(url), Some(ca)) = (&url, &written.otlp_ca)
             && !url.is_encrypted()
         {
@@ -674,7 +677,68 @@ impl Resolver<'_> {
         Some(OtlpConfig { url: url?, interval: interval.unwrap_or(OtlpConfig::INTERVAL), headers_file, ca })
     }
 
-    fn otlp_file(
+    fn store(&mut self, draft: &Draft, mapping: MappingKind) -> Option<StoreSettings> {
+        let StoreDraft { servers: urls, prefix, user, password_file, ca, certificate, key } = &draft.store;
+        let files =
+            [password_file, ca, certificate, key].map(|file| file.as_ref().map(|f| (f.key, &f.origin)));
+        let words = [prefix, user].map(|word| word.as_ref().map(|w| (w.key, &w.origin)));
+        if mapping != MappingKind::Store {
+            let servers = urls.first().map(|url| (url.key, &url.origin));
+            let unused = servers.into_iter().chain(words.into_iter().chain(files).flatten());
+            for (key, origin) in unused.filter(|_| !draft.attempted.contains("mapping")) {
+                self.record(origin, Mistake::StoreUnused { key });
+            }
+            return None;
+        }
+        if let Some(mapping) = draft.mapping.as_ref().filter(|_| urls.is_empty())
+            && !draft.attempted.contains("store")
+        {
+            self.record(&mapping.origin, Mistake::StoreMissing);
+        }
+        if let Some(url) = urls.get(SERVERS_MAX) {
+            let (key, count, max) = (url.key, urls.len(), SERVERS_MAX);
+            self.record(&url.origin, Mistake::TooManyEntries { key, count, max });
+        }
+        let mut servers = Vec::new();
+        for url in urls.iter().take(SERVERS_MAX) {
+            let Some(server) = self.keep(url, names::store_server) else { continue };
+            if servers
+                .first()
+                .is_some_and(|first: &StoreServer| first.is_encrypted() != server.is_encrypted())
+            {
+                self.record(&url.origin, Mistake::StoreMixed { key: url.key });
+            }
+            servers.push(server);
+        }
+        let is_open = servers.first().is_some_and(|server| !server.is_encrypted());
+        for (key, origin) in files[1..].iter().flatten().filter(|_| is_open) {
+            self.record(origin, Mistake::StoreTlsUnused { key });
+        }
+        let pairs = [(words[1], files[0], "store_password_file"), (files[0], words[1], "store_user")]
+            .into_iter()
+            .chain([(files[2], files[3], "store_key"), (files[3], files[2], "store_certificate")]);
+        for (one, other, missing) in pairs {
+            if let (Some((key, origin)), None) = (one, other) {
+                self.record(origin, Mistake::StoreHalf { key, missing });
+            }
+        }
+        let prefix = prefix.as_ref().and_then(|prefix| self.keep(prefix, names::store_prefix));
+        let password_file = password_file.as_ref().and_then(|f| self.path(f, "\"store.password\""));
+        let checks = self.checks;
+        let ca = self.checked_file(ca.as_ref(), "\"store-ca.pem\"", checks.map(|checks| checks.roots));
+        let chain = checks.map(|checks| checks.chain);
+        let certificate = self.checked_file(certificate.as_ref(), "\"router.pem\"", chain);
+        let key = self.checked_file(key.as_ref(), "\"router.key\"", checks.map(|checks| checks.private_key));
+        Some(StoreSettings {
+            servers,
+            prefix: prefix.unwrap_or_default(),
+            user: user.as_ref().map(|user| user.value.clone()).zip(password_file),
+            ca,
+            certificate: certificate.zip(key),
+        })
+    }
+
+    fn checked_file(
         &mut self,
         written: Option<&WithOrigin<PathBuf>>,
         example: &'static str,
@@ -1123,7 +1187,8 @@ fn mapping(key: &'static str, value: &str) -> Result<MappingKind, Mistake> {
     match value {
         "flood" => Ok(MappingKind::Flood),
         "query" => Ok(MappingKind::Query),
-        _ => Err(unknown_word(key, value, &["flood", "query"])),
+        "store" => Ok(MappingKind::Store),
+        _ => Err(unknown_word(key, value, &["flood", "query", "store"])),
     }
 }
 

@@ -179,7 +179,20 @@ impl Table {
                 "token",
                 "link",
             ],
-            Self::Router => &["listen", "peer_rate", "mapping", "announce", "accept"],
+            Self::Router => &[
+                "listen",
+                "peer_rate",
+                "mapping",
+                "announce",
+                "accept",
+                "store",
+                "store_prefix",
+                "store_user",
+                "store_password_file",
+                "store_ca",
+                "store_certificate",
+                "store_key",
+            ],
             Self::Transport => {
                 &["congestion", "offload", "mtu_discovery", "bulk_lanes", "dtls_1_2", "dscp", "lane_dscp"]
             }

@@ -47,6 +47,7 @@ pub use gateway::certificate::{
 };
 pub use gateway::{GatewayStartError, OpenLocalRos};
 pub use link::push_crl::{PushCrlError, push_crl};
+pub use link::store::{StoreSettingsError, load_store};
 pub use metrics::push::PushStatus;
 pub use metrics::series::{METRICS, Metric, MetricKind};
 pub use node::{

@@ -8,6 +8,7 @@ use std::time::Instant;
 use serde::Serialize;
 use sgc_gateway::GatewayStatus;
 use sgc_ros::RouteStatus;
+use sgc_router::StoreStats;
 use sgc_wire::Name;
 
 use super::not_direct::{NotDirectPeer, NotDirectReason};
@@ -54,6 +55,8 @@ pub struct Status {
     pub local_network_reopened: u64,
     /// The size of the routing state.
     pub router: RouterLine,
+    /// The store of names of this router; null without one.
+    pub store: Option<StoreLine>,
     /// The gateway for programs without ROS; null without `[gateway]`.
     pub gateway: Option<GatewayStatus>,
     /// The URL at which metrics are served; null if they are not.
@@ -268,4 +271,53 @@ pub struct RouterLine {
     pub routed_names: usize,
     /// Branches of trees.
     pub branches: usize,
+}
+
+/// The store of names of a router.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct StoreLine {
+    /// `true` while the store answers.
+    pub answers: bool,
+    /// Seconds since it does not; null while it does.
+    pub down_s: Option<u64>,
+    /// Look-ups that found a name.
+    pub found: u64,
+    /// Look-ups of names that the store does not have.
+    pub absent: u64,
+    /// Operations so far.
+    pub operations: u64,
+    /// Operations that failed.
+    pub failures: u64,
+    /// Operations, and steps of work, that are under way or wait.
+    pub pending: usize,
+    /// Values from the store that were not what their key says.
+    pub refused: u64,
+    /// Names that the store had lost, and that this router wrote again.
+    pub healed: u64,
+    /// Names without an owner's announcement that this router removed.
+    pub orphans: u64,
+    /// Values that this router keeps.
+    pub cached: usize,
+    /// Memory that they take, bytes.
+    pub cached_bytes: usize,
+}
+
+impl StoreLine {
+    pub(crate) fn new(now: Instant, stats: StoreStats) -> Self {
+        let down = stats.down_since.map(|since| now.saturating_duration_since(since).as_secs());
+        Self {
+            answers: down.is_none(),
+            down_s: down,
+            found: stats.found,
+            absent: stats.absent,
+            operations: stats.operations,
+            failures: stats.failures,
+            pending: stats.pending,
+            refused: stats.refused,
+            healed: stats.healed,
+            orphans: stats.orphans,
+            cached: stats.cached,
+            cached_bytes: stats.cached_bytes,
+        }
+    }
 }

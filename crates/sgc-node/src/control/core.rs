@@ -25,7 +25,7 @@ use std::time::Instant;
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
 use sgc_ros::{RosNetwork, Routes, ShareRule, UseRule};
-use sgc_router::{Output as RouterOutput, Router};
+use sgc_router::{Output as RouterOutput, Router, StoreOp};
 use sgc_session::KeepAlivePolicy;
 use sgc_sync::Workers;
 use sgc_transport::{AnyLink, CredentialStore};
@@ -100,6 +100,8 @@ pub(crate) struct Core<N: RosNetwork> {
     inbox: Inbox,
     links: LinkTable,
     direct: DirectLinks,
+    /// The task of the store of names.
+    store: Option<mpsc::Sender<StoreOp>>,
     /// A grant came since the last look at the peers of direct links.
     is_newly_granted: bool,
     forwards: ForwardTable,
@@ -164,6 +166,8 @@ pub(crate) struct CoreParts<N> {
     pub(crate) rates: PeerRates,
     /// Set if this node is the authority of its fleet.
     pub authority: Option<Authority>,
+    /// The task of the store, at a router that keeps names in one.
+    pub(crate) store: Option<mpsc::Sender<StoreOp>>,
     /// Messages of one source under one key.
     pub epoch_messages_max: u64,
     /// Signing keys for the suites of its shares.
@@ -246,6 +250,7 @@ impl<N: RosNetwork> Core<N> {
             inbox: Inbox::default(),
             links: LinkTable::new(parts.keep_alive_policy, parts.names.clone(), data.clone()),
             direct: DirectLinks::new(own, parts.direct, Grantees::default(), parts.rng),
+            store: parts.store,
             is_newly_granted: false,
             forwards: ForwardTable::default(),
             shares,
@@ -347,6 +352,7 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Check(check) => self.check_arrived(&check),
             CoreEvent::HostAddresses(addresses) => self.host_addresses(addresses),
             CoreEvent::PortMapping(report) => self.port_mapped(report),
+            CoreEvent::Store(event) => self.router.handle_store(now(), event),
             CoreEvent::NotDialled(peer) => self.direct.not_dialled(Instant::now(), peer),
             CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
             CoreEvent::Malformed { link } => {

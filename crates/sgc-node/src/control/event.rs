@@ -8,7 +8,7 @@ use sgc_ros::{
     DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosClient, RosServer, Routes, ServiceSpec, ShareRule,
     ShownEndpoint, UseRule,
 };
-use sgc_router::{LinkId, PathKind};
+use sgc_router::{LinkId, PathKind, StoreEvent};
 use sgc_transport::{AnyLink, CheckDatagram};
 use sgc_trust::{CrlError, Grantees, Identity, NodeName, TrustAnchors};
 use sgc_wire::{Control, Name, NodeId, Operation, OperationAnswer, Report, ReportQuestion, SourceId};
@@ -78,6 +78,8 @@ pub(crate) enum CoreEvent {
     HostAddresses(Vec<HostAddress>),
     /// The state of the port mapping changed.
     PortMapping(MappingReport),
+    /// News from the store of names.
+    Store(StoreEvent),
     /// No direct link to this peer was made.
     NotDialled(NodeId),
     /// A link has taken all control frames before a flush.

@@ -12,4 +12,5 @@ pub(crate) mod port_mapping;
 pub(crate) mod push_crl;
 pub(crate) mod renewal;
 pub(crate) mod roaming;
+pub(crate) mod store;
 mod upnp;

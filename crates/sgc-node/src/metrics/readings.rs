@@ -7,7 +7,7 @@ use sgc_gateway::GatewayStatus;
 use sgc_ros::{RouteState, RouteStatus};
 use sgc_wire::UnixMillis;
 
-use crate::admin::status::RouterLine;
+use crate::admin::status::{RouterLine, StoreLine};
 use crate::control::faults::alerts::Alert;
 use crate::discovery::RouterStatus;
 use crate::metrics::push::PushStatus;
@@ -42,6 +42,7 @@ pub(crate) struct Readings {
     /// The number of times that the local network was opened again.
     pub(crate) reopened: u64,
     pub(crate) router: RouterLine,
+    pub(crate) store: Option<StoreLine>,
     /// The gateway, if there is one.
     pub(crate) gateway: Option<GatewayStatus>,
     /// Pushes of metrics, if there are some.

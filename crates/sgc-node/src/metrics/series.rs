@@ -273,6 +273,31 @@ pub const METRICS: &[Metric] = &[
     gauge("sgc_tree_branches", &[], "Branches of trees of names.", |s| {
         unlabelled(as_f64(s.readings.router.branches as u64))
     }),
+    gauge("sgc_store_answers", &[], "1 while the store of names answers, otherwise 0.", |s| {
+        unlabelled(s.readings.store.map(|store| if store.answers { 1.0 } else { 0.0 }))
+    }),
+    counter("sgc_store_operations_total", &[], "Operations of the store of names.", |s| {
+        unlabelled(s.readings.store.map(|store| as_f64(store.operations)))
+    }),
+    counter("sgc_store_failures_total", &[], "Operations of the store of names that failed.", |s| {
+        unlabelled(s.readings.store.map(|store| as_f64(store.failures)))
+    }),
+    counter("sgc_store_look_ups_total", &["result"], "Look-ups of names in the store, by result.", |s| {
+        let results = s.readings.store.iter().flat_map(|s| [("found", s.found), ("absent", s.absent)]);
+        by_label(results.map(|(result, count)| (result, as_f64(count))))
+    }),
+    counter("sgc_store_refused_total", &[], "Values of the store that were not what their key says.", |s| {
+        unlabelled(s.readings.store.map(|store| as_f64(store.refused)))
+    }),
+    counter(
+        "sgc_store_healed_total",
+        &[],
+        "Names that the store had lost, and that were written again.",
+        |s| unlabelled(s.readings.store.map(|store| as_f64(store.healed))),
+    ),
+    gauge("sgc_store_cached_bytes", &[], "Memory of values that were read from the store.", |s| {
+        unlabelled(s.readings.store.map(|store| as_f64(store.cached_bytes as u64)))
+    }),
     gauge("sgc_gateway_clients", &["protocol"], "Connected clients of the gateway.", |s| {
         let clients = s.readings.gateway.iter().flat_map(|gateway| &gateway.clients);
         by_label(clients.map(|client| (&client.protocol, 1.0)))
@@ -415,6 +440,7 @@ pub(super) fn sample() -> Sample {
         refused: BTreeMap::new(),
         reopened: 0,
         router: crate::admin::status::RouterLine { nodes: 1, names: 2, routed_names: 2, branches: 0 },
+        store: None,
         gateway: None,
         pushes: Some(pushes),
     };

@@ -11,8 +11,9 @@ use rand_core::SeedableRng;
 use sgc_config::{Config, MetricsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_ros::{RosNetwork, Routes};
-use sgc_router::{Router, RouterConfig};
+use sgc_router::{Router, RouterConfig, StoreOp};
 use sgc_session::KeepAlivePolicy;
+use sgc_store::StoreConfig;
 use sgc_transport::{
     BulkLanes, CredentialStore, Dialer, DirectSockets, LinkOptions, ListenAddr, Listener, Scheme,
     TransportMetrics,
@@ -38,6 +39,7 @@ use crate::gateway::certificate::gateway_expiry_warning;
 use crate::gateway::{Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, Sockets, listen_at};
 use crate::link::direct_address::{DIRECT_DIALS_MAX, DirectDial};
 use crate::link::mapping_report::{MappingOff, MappingWish};
+use crate::link::store::{OPERATIONS_MAX, load_store};
 use crate::local::network_slot::NetworkSlot;
 use crate::metrics::Metrics;
 use crate::node::error::NodeError;
@@ -94,6 +96,8 @@ pub(super) struct CoreChannels {
     pub(super) direct_dials: mpsc::Receiver<DirectDial>,
     /// Whether a port is to be mapped.
     pub(super) mapping_wishes: watch::Receiver<MappingWish>,
+    /// The store of names, and the operations for it.
+    pub(super) store: Option<(StoreConfig, mpsc::Receiver<StoreOp>)>,
     /// Requests of the control task's sinks.
     pub(super) requested: mpsc::Receiver<SinkRequest>,
     /// Notified when links have to be made again.
@@ -122,6 +126,13 @@ pub(super) async fn build<N: RosNetwork>(
     let (mapping, mapping_wishes) = watch::channel(MappingWish::Off(MappingOff::NoDirectLinks));
     let direct = sockets.direct.as_ref();
     let direct = direct.map(|direct| DirectEnds { handle: direct.handle.clone(), dials, mapping });
+    let store = open_store(&config, &identity).await?;
+    let (store, store_operations) = store
+        .map(|config| {
+            let (operations, waiting) = mpsc::channel(OPERATIONS_MAX);
+            ((config, waiting), operations)
+        })
+        .unzip();
     let mut rng = system_rng()?;
     let machines = Machines::new(&config, &identity, &rules, anchors, network.is_some(), &mut rng);
     let again = open.as_ref().zip(config.ros.as_ref()).map(|(open, ros)| open_again(open, ros));
@@ -148,6 +159,7 @@ pub(super) async fn build<N: RosNetwork>(
         member_names: rules.members.clone(),
         observers: rules.observers.clone(),
         direct,
+        store: store_operations,
         direct_peers: rules.direct.clone(),
         port_mapping: rules.port_mapping,
         rng: ChaCha20Rng::from_rng(&mut rng),
@@ -180,7 +192,7 @@ pub(super) async fn build<N: RosNetwork>(
         storage,
     });
     let channels =
-        CoreChannels { events, inbox, direct_dials, mapping_wishes, requested, on_redial, all_ended };
+        CoreChannels { events, inbox, direct_dials, mapping_wishes, store, requested, on_redial, all_ended };
     Ok(BuiltNode {
         config,
         identity,
@@ -282,6 +294,20 @@ fn bulk_lanes(config: &Config, addr: &ListenAddr) -> BulkLanes {
 }
 
 /// The machines that the control task owns.
+/// Returns `true` for a node that carries names of others.
+fn is_router(config: &Config, identity: &Identity) -> bool {
+    !config.listen.is_empty() && identity.as_peer().may_route
+}
+
+/// Reads the settings of the store of names, at a router that has one.
+async fn open_store(config: &Config, identity: &Identity) -> Result<Option<StoreConfig>, NodeError> {
+    let Some(settings) = config.store.clone().filter(|_| is_router(config, identity)) else {
+        return Ok(None);
+    };
+    let loaded = tokio::task::spawn_blocking(move || load_store(&settings)).await;
+    Ok(Some(loaded.map_err(|_| NodeError::Panicked)??))
+}
+
 struct Machines {
     router: Router,
     endpoint: Endpoint,
@@ -302,7 +328,7 @@ impl Machines {
         let router_config = RouterConfig {
             node: identity.node_id(),
             identity: identity.clone(),
-            transit: !config.listen.is_empty() && identity.as_peer().may_route,
+            transit: is_router(config, identity),
             incarnation: rand_core::RngCore::next_u64(rng),
             started: started.unix,
             mapping: config.mapping,

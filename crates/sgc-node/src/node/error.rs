@@ -10,6 +10,7 @@ use sgc_trust::{AnchorError, IdentityError};
 use crate::control::settings::rules::RulesError;
 use crate::gateway::GatewayStartError;
 use crate::gateway::access::AccessError;
+use crate::link::store::StoreSettingsError;
 use crate::state::run_lock::IdentityInUse;
 use crate::state::{StateError, owner_hint};
 
@@ -88,6 +89,9 @@ pub enum NodeError {
         /// The node.
         node: String,
     },
+    /// The store of names cannot be used as it is configured.
+    #[error(transparent)]
+    Store(#[from] StoreSettingsError),
     /// The state directory cannot be used.
     #[error(transparent)]
     State(#[from] StateError),

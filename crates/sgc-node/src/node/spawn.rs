@@ -26,6 +26,7 @@ use crate::link::lanes::LaneAdmission;
 use crate::link::links::{Admission, keep_accepting};
 use crate::link::port_mapping;
 use crate::link::roaming::Network;
+use crate::link::store;
 use crate::local::dds_discovery::discover;
 use crate::local::network_slot::NetworkSlot;
 use crate::local::reopening;
@@ -116,6 +117,9 @@ pub(super) async fn spawn<N: RosNetwork>(
         let (network, core) = (keeper.network.onward(), events.clone());
         let keep_mapped = port_mapping::serve(channels.mapping_wishes, network, core, mapping_rng);
         mapping = Some(tokio::spawn(keep_mapped));
+    }
+    if let Some((config, operations)) = channels.store {
+        tasks.push(tokio::spawn(store::serve(config, operations, events.clone())));
     }
     let node_name = identity.node_name().to_string();
     let socket = admin_socket_path(&config, &node_name);

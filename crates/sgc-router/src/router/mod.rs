@@ -98,7 +98,7 @@ impl Router {
             syncs: Syncs::default(),
             lists: ListAllowances::default(),
             store: (config.transit && config.mapping == MappingKind::Store)
-                .then(|| Store::new(config.limits.store_cache_bytes)),
+                .then(|| Store::new(now.instant, config.limits.store_cache_bytes)),
             outputs: Outputs::default(),
             late_at: None,
             claim: Claim::TakesOver,

@@ -40,8 +40,8 @@ const PACE: Duration = Duration::from_micros(500);
 /// The state of a router's store, for status.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StoreStats {
-    /// Whether the store answers.
-    pub up: bool,
+    /// Time since which the store does not answer; `None` while it does.
+    pub down_since: Option<Instant>,
     /// Values that are kept.
     pub cached: usize,
     /// Memory of them, bytes.
@@ -201,7 +201,7 @@ pub(crate) struct Store {
 }
 
 impl Store {
-    pub(crate) fn new(cache_bytes_max: usize) -> Self {
+    pub(crate) fn new(now: Instant, cache_bytes_max: usize) -> Self {
         Self {
             cache: Cache::new(cache_bytes_max),
             next_op: 0,
@@ -215,7 +215,7 @@ impl Store {
             repetitions: BTreeMap::new(),
             failures_in_row: 0,
             findings: VecDeque::new(),
-            stats: StoreStats::default(),
+            stats: StoreStats { down_since: Some(now), ..StoreStats::default() },
         }
     }
 
@@ -235,13 +235,15 @@ impl Store {
     pub(crate) fn handle(&mut self, now: Instant, event: StoreEvent) {
         match event {
             StoreEvent::Up => {
-                self.stats.up = true;
+                self.stats.down_since = None;
                 self.failures_in_row = 0;
                 self.cache.clear();
                 self.reads.values_mut().for_each(|readers| readers.is_outdated = true);
                 self.findings.push_back(Finding::Up);
             }
-            StoreEvent::Down => self.stats.up = false,
+            StoreEvent::Down => {
+                self.stats.down_since.get_or_insert(now);
+            }
             StoreEvent::Changed(key) => {
                 self.cache.remove(&key);
                 if let Some(readers) = self.reads.get_mut(&key) {
@@ -344,7 +346,7 @@ impl Store {
             self.look_ups.insert(name, LookUp { others_asked: false, state: LookUpState::ExpectEntry });
             self.want(now, name, StoreKey::Name(name));
         }
-        if self.stats.up {
+        if self.stats.down_since.is_none() {
             return LookUpStart::UnderWay;
         }
         if let Some(look_up) = self.look_ups.get_mut(&name) {

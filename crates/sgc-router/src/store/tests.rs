@@ -14,7 +14,7 @@ fn entry(owner: u8) -> NameEntry {
 
 /// A store that answers, with a machine that took this news.
 fn up(now: Instant) -> Store {
-    let mut store = Store::new(1 << 20);
+    let mut store = Store::new(now, 1 << 20);
     store.handle(now, StoreEvent::Up);
     assert_eq!(store.take_finding(), Some(Finding::Up));
     store
@@ -120,7 +120,7 @@ fn operation_without_a_result_fails_in_time() {
 #[test]
 fn look_up_while_the_store_is_down_is_no_reason_to_wait() {
     let now = Instant::now();
-    let mut store = Store::new(1 << 20);
+    let mut store = Store::new(now, 1 << 20);
     assert_eq!(store.look_up(now, name(1)), LookUpStart::Unavailable);
     let op = operations(&mut store, now).remove(0);
     answer(&mut store, now, &op, Err(StoreFailure::Unreachable));

@@ -24,6 +24,10 @@ const ELSEWHERE: &str = "another router";
 /// announcements.
 const UNSENT_SHOWN_S: u64 = 60;
 
+/// Seconds without an answer after which the store counts as down: more than a router needs to connect to it, and than a
+/// cluster needs to replace a server.
+const STORE_DOWN_SHOWN_S: u64 = 5;
+
 impl<N: RosNetwork> Core<N> {
     /// Closes the link of a run that another run of the same node superseded. A run that returns after it was told so
     /// is a second process; both it and the operator are told.
@@ -144,6 +148,11 @@ impl<N: RosNetwork> Core<N> {
         let closed = self.reopening.failure().map(str::to_owned);
         alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
         alerts.extend(self.storage.alert().into_iter().chain(self.audit.alert()));
+        let store_down = self.router.store_stats().and_then(|store| store.down_since);
+        alerts.extend(store_down.and_then(|since| {
+            let ago_s = now.instant.saturating_duration_since(since).as_secs();
+            (ago_s >= STORE_DOWN_SHOWN_S).then_some(Alert::StoreDown { ago_s })
+        }));
         alerts.extend(strangers::alerts());
         alerts.extend(self.owners_here().into_iter().map(|node| Alert::SameLocalNetwork { node }));
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {

@@ -48,10 +48,14 @@ impl<N: RosNetwork> Core<N> {
                     debug!(link = %dropped.link, reason = %dropped.reason, "control frame refused");
                 }
             }
-            // This node reaches no store.
             RouterOutput::Store(operation) => {
-                let result = Err(StoreFailure::Unreachable);
-                self.router.handle_store(now(), StoreEvent::Reply { id: operation.id, result });
+                let id = operation.id;
+                // There is room for all operations that a router has under way.
+                let is_taken = self.store.as_ref().is_some_and(|store| store.try_send(operation).is_ok());
+                if !is_taken {
+                    let result = Err(StoreFailure::Unreachable);
+                    self.router.handle_store(now(), StoreEvent::Reply { id, result });
+                }
             }
             RouterOutput::Timeout(_) => {}
         }

@@ -10,7 +10,7 @@ use sgc_router::LinkId;
 use super::Core;
 use crate::admin::not_direct::NOT_DIRECT_MAX;
 use crate::admin::status::{
-    LinkStatus, NameStatus, NotDirect, PortMappingStatus, RouteLine, RouterLine, Status,
+    LinkStatus, NameStatus, NotDirect, PortMappingStatus, RouteLine, RouterLine, Status, StoreLine,
 };
 use crate::control::parts::link_table::LinkEntry;
 use crate::data::stats::CountDrops;
@@ -44,6 +44,7 @@ impl<N: RosNetwork> Core<N> {
             refused: self.all_refused(),
             local_network_reopened: self.reopening.reopenings(),
             router: self.router_line(),
+            store: self.store_line(),
             // The caller adds them, since the core knows nothing of the gateway and of metrics.
             gateway: None,
             metrics: None,
@@ -72,6 +73,7 @@ impl<N: RosNetwork> Core<N> {
             refused: self.all_refused(),
             reopened: self.reopening.reopenings(),
             router,
+            store: self.store_line(),
             gateway: None,
             pushes: None,
         }
@@ -99,6 +101,10 @@ impl<N: RosNetwork> Core<N> {
             }
         }
         readings
+    }
+
+    fn store_line(&self) -> Option<StoreLine> {
+        Some(StoreLine::new(Instant::now(), self.router.store_stats()?))
     }
 
     fn router_line(&self) -> RouterLine {

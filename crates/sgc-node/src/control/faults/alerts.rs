@@ -140,6 +140,11 @@ pub enum Alert {
         /// The reason.
         reason: String,
     },
+    /// The store of names does not answer.
+    StoreDown {
+        /// Seconds since the router noticed it.
+        ago_s: u64,
+    },
     /// The audit log cannot be written.
     AuditNotWritten {
         /// The file.
@@ -241,6 +246,10 @@ impl Alert {
                 "free space on its disk or mount it to be written, or set `state` in [node] to a directory that can be written; restart the \
                  node if there was no directory"
             }
+            Self::StoreDown { .. } => {
+                "`sgc router store check` tells what is wrong with it. Names that are in use go on, and other names are asked of all \
+                 routers until it answers"
+            }
             Self::AuditNotWritten { .. } => {
                 "free space on its disk or mount it to be written, or name another file with `file` in [audit]. The node tries again by \
                  itself"
@@ -329,6 +338,9 @@ impl fmt::Display for Alert {
             }
             Self::StateNotKept { reason } => {
                 write!(f, "nothing is kept over a restart, revocation lists included: {reason}")
+            }
+            Self::StoreDown { ago_s } => {
+                write!(f, "the store of names has not answered for {ago_s} s, so new names are found more slowly")
             }
             Self::AuditNotWritten { path, reason } => {
                 write!(f, "the audit log {path} cannot be written, and events are lost from it: {reason}")

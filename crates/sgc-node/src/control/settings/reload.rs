@@ -714,7 +714,7 @@ fn needs_restart(running: &Running, config: &Config) -> Vec<String> {
         (now.resolver != config.resolver, "`resolver`"),
         (now.keep_alive != config.keep_alive, "`keep_alive`"),
         (now.listen != config.listen, "`listen` in [router]"),
-        (now.mapping != config.mapping, "`mapping` in [router]"),
+        (now.mapping != config.mapping || now.store != config.store, "`mapping` in [router], or its store"),
         (now.announce != config.announce, "`announce` in [router]"),
         // Shares and uses join the default network if the file has no `[ros]`.
         (config.ros.is_some() && now.ros != config.ros, "[ros]"),
