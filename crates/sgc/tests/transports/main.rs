@@ -18,6 +18,7 @@ mod mapping;
 mod node;
 mod real;
 mod shown;
+mod store;
 #[path = "../support/mod.rs"]
 mod support;
 
@@ -85,8 +86,23 @@ impl Pair {
         [shares, uses]: [&str; 2],
         routers: &[&str],
     ) -> Self {
+        Self::over(lab, scheme, [robot, desk], [shares, uses], [routers, &[&lab.url(scheme)]])
+    }
+
+    /// Starts both at a router each, by QUIC.
+    fn between(lab: &Lab, names: [&str; 2], rest: [&str; 2], [near, far]: [&str; 2]) -> Self {
+        Self::over(lab, "quic", names, rest, [&[near], &[far]])
+    }
+
+    fn over(
+        lab: &Lab,
+        scheme: &'static str,
+        [robot, desk]: [&str; 2],
+        [shares, uses]: [&str; 2],
+        [routers, routers_of_desk]: [&[&str]; 2],
+    ) -> Self {
         let [near, far] = [FakeDomain::default(), FakeDomain::default()];
-        let desk_file = lab.write_config(desk, &[&lab.url(scheme)], uses);
+        let desk_file = lab.write_config(desk, routers_of_desk, uses);
         let robot_file = lab.write_config(robot, routers, shares);
         let desk = Node::start(&lab.desk, &desk_file, lab.enroll(desk, false), Some(&far));
         let robot = Node::start(&lab.robot, &robot_file, lab.enroll(robot, false), Some(&near));
