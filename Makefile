@@ -9,7 +9,7 @@ FEATURES := --features sgc/sros2
 # other tests, too; then those with programs of others are ignored. A name stands for the suites of all crates, so no suite of
 # `unit` may have one of these names: it would run twice.
 LABS := $(addprefix --test ,fidelity gateway peers ros2)
-INTEROP := $(addprefix --test ,browser dashboard gateway_soak looking mended ring ros_graph soak transports vendors)
+INTEROP := $(addprefix --test ,browser dashboard gateway_soak looking mended redis ring ros_graph soak transports vendors)
 CLIENTS := $(addprefix --test ,foxglove grpc otlp rosbridge)
 
 # Release builds name their commit (`sgc --version`), as far as the environment or the repository knows it.

@@ -69,6 +69,7 @@ if [ "$what" = test ]; then
     need 'command -v nft' nftables -- "NATs and firewalls between them"
     # The package leaves its service off unless debconf is told otherwise.
     need 'test -x /usr/sbin/miniupnpd' miniupnpd miniupnpd-nftables -- "a gateway that maps ports (PCP, NAT-PMP, UPnP-IGD)"
+    need 'command -v redis-server && command -v redis-cli' redis-server -- "a store of names"
     need 'compgen -G "/usr/lib/*/faketime/libfaketimeMT.so.1"' libfaketime -- "nodes with wrong clocks"
     need 'command -v openssl' openssl -- "an independent DTLS program, a keystore for DDS Security"
 fi

@@ -12,7 +12,7 @@ use bytes::Bytes;
 use sgc_router::{
     BatchTag, StoreAction, StoreEvent, StoreFailure, StoreKey, StoreOp, StoreOpId, StoreReply, WriteIf,
 };
-use sgc_store::{StoreConfig, StorePrefix, StoreServer, StoreUser, run};
+use sgc_store::{Severity, StoreConfig, StoreFinding, StorePrefix, StoreServer, StoreUser, check, run};
 use sgc_testkit::netsim::Namespace;
 use sgc_testkit::redis::{Redis, RedisOptions, is_redis_installed};
 use sgc_wire::{Name, NodeId};
@@ -450,5 +450,133 @@ fn restarted_cluster_is_down_and_up_again() {
         client.up().await;
         client.until_done(name(1), &write("again", WriteIf::Always)).await;
         assert_eq!(client.value(name(1)).await, Some("again".into()));
+    });
+}
+
+const PASSWORD: &str = "correct-horse";
+
+fn router_user(password: &str) -> StoreUser {
+    StoreUser::new("router", password.as_bytes().to_vec()).unwrap()
+}
+
+#[test]
+fn check_of_a_store_that_fits_finds_nothing_to_mend() {
+    for mut lab in [Lab::single(), Lab::cluster()] {
+        let config = lab.config();
+        let report = lab.client(async |_, _| check(config.clone()).await);
+        assert_eq!(report.severity(), Severity::Fits, "{report:#?}");
+        assert!(matches!(report.findings.last(), Some(StoreFinding::Works { .. })), "{report:#?}");
+    }
+}
+
+#[test]
+fn check_of_a_store_that_is_gone_or_evicts_says_so() {
+    let mut lab = Lab::single();
+    let config = lab.config();
+    lab.client(async |_, redis| {
+        redis.cli(0, &["CONFIG", "SET", "maxmemory", "100mb"]);
+        redis.cli(0, &["CONFIG", "SET", "maxmemory-policy", "allkeys-lru"]);
+        let report = check(config.clone()).await;
+        let is_error = |finding: &StoreFinding| finding.severity() == Severity::Error;
+        let errors: Vec<_> = report.findings.iter().filter(|finding| is_error(finding)).collect();
+        assert!(matches!(errors[..], [StoreFinding::Eviction { .. }]), "{report:#?}");
+        redis.kill(0);
+        let report = check(config.clone()).await;
+        assert!(
+            matches!(report.findings[..], [StoreFinding::ServerFails { is_refused: false, .. }]),
+            "{report:#?}"
+        );
+    });
+}
+
+/// The fix of a refusal is a command with the least rights: with it, everything works.
+#[test]
+fn user_with_the_rights_that_a_check_names_can_do_everything_that_a_router_does() {
+    let mut lab = Lab::cluster();
+    let url = lab.redis.urls()[..1].to_vec();
+    lab.client(async |_, redis| {
+        let on_all = |redis: &mut Redis, command: &[&str]| {
+            (0..HOSTS.len()).for_each(|index| assert_eq!(redis.cli(index, command).trim(), "OK"));
+        };
+        let wrong = check(config(&url, Some(router_user("wrong")))).await;
+        assert!(
+            matches!(wrong.findings[..], [StoreFinding::ServerFails { is_refused: true, .. }]),
+            "{wrong:#?}"
+        );
+        let password = format!(">{PASSWORD}");
+        on_all(redis, &["ACL", "SETUSER", "router", "on", &password, "+@connection", "+cluster"]);
+        let of_user = config(&url, Some(router_user(PASSWORD)));
+        let refused = check(of_user.clone()).await;
+        let Some(finding @ StoreFinding::Refused { rights, .. }) = refused.findings.last() else {
+            panic!("{refused:#?}");
+        };
+        assert!(finding.fix().is_some_and(|fix| fix.contains(rights)));
+        let rights: Vec<_> = rights.split(' ').collect();
+        on_all(redis, &rights);
+        let report = check(of_user.clone()).await;
+        assert!(matches!(report.findings.last(), Some(StoreFinding::Works { .. })), "{report:#?}");
+        assert_eq!(report.severity(), Severity::Warning, "INFO and CONFIG are refused: {report:#?}");
+        let mut client = Client::start(of_user);
+        all_operations(&mut client).await;
+        client.end().await;
+        // Another fleet's keys are out of reach.
+        let other = StoreConfig::new(
+            vec![StoreServer::parse(&url[0]).unwrap()],
+            StorePrefix::new("fleet-b").unwrap(),
+            Some(router_user(PASSWORD)),
+            None,
+        );
+        let mut client = Client::start(other.unwrap());
+        client.up().await;
+        assert_eq!(client.try_op(name(1), StoreAction::Read).await, Err(StoreFailure::Refused));
+        client.end().await;
+    });
+}
+
+/// A server of the test that answers the greeting, and then anything else with these bytes.
+async fn lie(listener: tokio::net::TcpListener, bytes: &'static [u8]) {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+    loop {
+        let Ok((mut stream, _)) = listener.accept().await else { return };
+        tokio::spawn(async move {
+            let mut buffer = [0; 4096];
+            let mut answers = 0;
+            while let Ok(1..) = stream.read(&mut buffer).await {
+                let answer: &[u8] = if answers < 2 { b"+OK\r\n" } else { bytes };
+                answers += 1;
+                if stream.write_all(answer).await.is_err() {
+                    return;
+                }
+            }
+        });
+    }
+}
+
+#[test]
+fn server_that_lies_costs_failed_operations_and_nothing_else() {
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+    let answers: [&'static [u8]; 8] = [
+        b"*-5\r\n",
+        b"$99999999999\r\n",
+        b"*1000000000\r\n",
+        b"%1000000000\r\n",
+        b">2\r\n$10\r\ninvalidate\r\n*1\r\n$3\r\nabc\r\n",
+        b"$-1\r\n$-1\r\n$-1\r\n",
+        b"-MOVED 99999 :0\r\n",
+        b"\x00\xff\xfe\r\n",
+    ];
+    runtime.block_on(async {
+        for answer in answers {
+            let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let url = format!("valkey://{}", listener.local_addr().unwrap());
+            let server = tokio::spawn(lie(listener, answer));
+            let mut client = Client::start(config(&[url], None));
+            let begin = Instant::now();
+            let result = client.try_op(name(1), StoreAction::Read).await;
+            assert!(!matches!(result, Ok(StoreReply::Value(Some(_)))), "{answer:?}: {result:?}");
+            assert!(begin.elapsed() < Duration::from_secs(5), "{answer:?}: {:?}", begin.elapsed());
+            client.end().await;
+            server.abort();
+        }
     });
 }

@@ -46,6 +46,7 @@ pub mod redis;
 mod rng;
 mod ros;
 mod seeds;
+mod shared_store;
 mod store;
 mod trust;
 mod wires;

@@ -46,6 +46,17 @@ pub(crate) enum CliError {
         /// The mistakes.
         errors: ConfigErrors,
     },
+    /// A configuration without a store of names.
+    #[error(
+        "{what}: it names no store: add mapping = \"store\" and store = [\"valkey://HOST:PORT\"] to [router]"
+    )]
+    NoStore {
+        /// The configuration file.
+        what: String,
+    },
+    /// The settings of a store cannot be used.
+    #[error(transparent)]
+    Store(#[from] sgc_node::StoreSettingsError),
     /// A text that is no name of a node, group or fleet.
     #[error(transparent)]
     Label(#[from] LabelError),
@@ -329,6 +340,8 @@ impl CliError {
     fn exit_code(&self) -> u8 {
         match self {
             Self::Config { .. }
+            | Self::NoStore { .. }
+            | Self::Store(_)
             | Self::Arguments { .. }
             | Self::Label(_)
             | Self::Process(ProcessError::Exists { .. } | ProcessError::Exposed { .. })

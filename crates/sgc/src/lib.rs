@@ -38,6 +38,7 @@ mod run;
 mod service;
 mod span;
 mod status;
+mod store;
 mod supervisor;
 mod token;
 mod topic;
@@ -155,7 +156,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Fleet(args) => return fleet::fleet(args),
         Command::Join(args) => fleet::join(args),
         Command::Run(args) => run::run(args),
-        Command::Router(args) => run::router(args),
+        Command::Router(args) => return run::router(args),
         Command::Check(args) => check::check(&args),
         Command::Why(args) => return why::why(&args),
         Command::Topic(args) => return topic::topic(&args),

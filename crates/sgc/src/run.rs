@@ -4,10 +4,11 @@
 //! parent may hold open.
 
 use std::path::PathBuf;
+use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use clap::Args;
+use clap::{Args, Subcommand};
 use sgc_node::config::{self, ArgsConfig};
 use sgc_node::{ConfigSource, RunOptions};
 use sgc_process::children::ReadyLine;
@@ -19,6 +20,7 @@ use tokio::time::Instant;
 use crate::environment::environment;
 use crate::error::CliError;
 use crate::log::{LogFormat, start_log};
+use crate::store::{self, StoreArgs};
 use crate::{descriptors, files, heap, output, supervisor, version};
 
 /// Time after which a node uses no more of what only its start needs. Threads of the start end within it.
@@ -77,10 +79,13 @@ pub(crate) struct RunArgs {
 ///
 /// With `--peer` it forms a mesh with other routers. With `--accept` it serves only the named fleets.
 #[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub(crate) struct RouterArgs {
+    #[command(subcommand)]
+    command: Option<RouterCommand>,
     /// Identity file, as `sgc fleet enroll --role router` writes it
-    #[arg(long, value_name = "FILE")]
-    identity: PathBuf,
+    #[arg(long, value_name = "FILE", required = true)]
+    identity: Option<PathBuf>,
     /// Address to listen on, such as quic://0.0.0.0:7447; may be repeated, or several separated by commas
     #[arg(long, value_name = "ADDRESS", value_delimiter = ',', required = true)]
     listen: Vec<String>,
@@ -96,6 +101,11 @@ pub(crate) struct RouterArgs {
     accept: Vec<PathBuf>,
     #[command(flatten)]
     process: ProcessArgs,
+}
+
+#[derive(Debug, Subcommand)]
+enum RouterCommand {
+    Store(StoreArgs),
 }
 
 impl RunArgs {
@@ -160,10 +170,13 @@ pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
 }
 
 /// Runs `sgc router`.
-pub(crate) fn router(args: RouterArgs) -> Result<(), CliError> {
+pub(crate) fn router(args: RouterArgs) -> Result<ExitCode, CliError> {
+    if let Some(RouterCommand::Store(args)) = &args.command {
+        return store::store(args);
+    }
     start_log(args.process.log.as_deref(), args.process.log_format)?;
     let arguments = ArgsConfig {
-        identity: Some(args.identity),
+        identity: args.identity,
         peers: args.peer,
         listen: args.listen,
         announce: args.announce,
@@ -171,7 +184,8 @@ pub(crate) fn router(args: RouterArgs) -> Result<(), CliError> {
         ..ArgsConfig::default()
     };
     let source: ConfigSource = Arc::new(move || config::load_args(&arguments, &environment));
-    run_node(source, None, "command line".to_owned(), &args.process)
+    run_node(source, None, "command line".to_owned(), &args.process)?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Hang-ups of a running node. A hang-up ends the node if its terminal is gone; otherwise it asks for a reload.
