@@ -2,7 +2,7 @@
 //!
 //! Debian 12 has no Valkey. Where the distribution has it, `SGC_REDIS_SERVER=valkey-server` runs the same tests on it.
 
-#![allow(missing_docs)]
+#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -326,7 +326,7 @@ fn slot_of(key: StoreKey) -> u16 {
 /// CRC-16/XMODEM modulo 16384.
 fn slot(key: &[u8]) -> u16 {
     let step = |crc: u16, byte: &u8| {
-        (0..8).fold(crc ^ u16::from(*byte) << 8, |crc, _| crc << 1 ^ (crc >> 15) * 0x1021)
+        (0..8).fold(crc ^ (u16::from(*byte) << 8), |crc, _| (crc << 1) ^ ((crc >> 15) * 0x1021))
     };
     key.iter().fold(0, step) % 16_384
 }

@@ -98,6 +98,7 @@ impl Cache {
 
 #[cfg(test)]
 mod tests {
+    use sgc_testkit::Clock;
     use sgc_wire::Name;
 
     use super::*;
@@ -108,7 +109,7 @@ mod tests {
 
     #[test]
     fn value_that_was_not_used_for_longest_gives_way() {
-        let now = Instant::now();
+        let now = Clock::default().now().instant;
         let mut cache = Cache::new(2 * (ENTRY_BYTES + 10));
         let value = Some(Bytes::from_static(b"0123456789"));
         cache.insert(now, key(1), value.clone());
@@ -123,7 +124,7 @@ mod tests {
 
     #[test]
     fn value_over_the_budget_is_not_kept() {
-        let now = Instant::now();
+        let now = Clock::default().now().instant;
         let mut cache = Cache::new(ENTRY_BYTES + 9);
         cache.insert(now, key(1), Some(Bytes::from_static(b"0123456789")));
         assert_eq!((cache.len(), cache.bytes()), (0, 0));
@@ -131,7 +132,7 @@ mod tests {
 
     #[test]
     fn absence_is_believed_for_a_while() {
-        let now = Instant::now();
+        let now = Clock::default().now().instant;
         let mut cache = Cache::new(1000);
         cache.insert(now, key(1), None);
         assert_eq!(cache.get(now + ABSENT_FOR - Duration::from_millis(1), &key(1)), Some(None));
@@ -141,7 +142,7 @@ mod tests {
 
     #[test]
     fn new_value_replaces_the_old_one() {
-        let now = Instant::now();
+        let now = Clock::default().now().instant;
         let mut cache = Cache::new(1000);
         cache.insert(now, key(1), None);
         cache.insert(now, key(1), Some(Bytes::from_static(b"new")));

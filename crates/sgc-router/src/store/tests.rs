@@ -1,5 +1,7 @@
 //! Tests of the store machine: bounds, repetitions, and changes that cross reads.
 
+use sgc_testkit::Clock;
+
 use super::*;
 
 fn name(number: u16) -> Name {
@@ -42,7 +44,7 @@ fn looked_up(name: Name, end: LookUpEnd) -> Finding {
 
 #[test]
 fn look_up_reads_the_name_and_then_batch_and_place_together() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = up(now);
     assert_eq!(store.look_up(now, name(1)), LookUpStart::UnderWay);
     assert_eq!(store.look_up(now, name(1)), LookUpStart::UnderWay);
@@ -68,7 +70,7 @@ fn look_up_reads_the_name_and_then_batch_and_place_together() {
 
 #[test]
 fn key_that_changes_while_it_is_read_is_read_again() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = up(now);
     store.look_up(now, name(1));
     let old = operations(&mut store, now).remove(0);
@@ -83,7 +85,7 @@ fn key_that_changes_while_it_is_read_is_read_again() {
 
 #[test]
 fn operations_under_way_are_bounded() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = up(now);
     for number in 0..2000 {
         store.look_up(now, name(number));
@@ -96,7 +98,7 @@ fn operations_under_way_are_bounded() {
 
 #[test]
 fn look_ups_are_bounded() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = up(now);
     let begun = (0..u16::MAX).filter(|n| store.look_up(now, name(*n)) == LookUpStart::UnderWay).count();
     assert_eq!(begun, LOOK_UPS_MAX);
@@ -104,7 +106,7 @@ fn look_ups_are_bounded() {
 
 #[test]
 fn operation_without_a_result_fails_in_time() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = up(now);
     store.look_up(now, name(1));
     let op = operations(&mut store, now).remove(0);
@@ -119,7 +121,7 @@ fn operation_without_a_result_fails_in_time() {
 
 #[test]
 fn look_up_while_the_store_is_down_is_no_reason_to_wait() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = Store::new(now, 1 << 20);
     assert_eq!(store.look_up(now, name(1)), LookUpStart::Unavailable);
     let op = operations(&mut store, now).remove(0);
@@ -130,7 +132,7 @@ fn look_up_while_the_store_is_down_is_no_reason_to_wait() {
 
 #[test]
 fn names_of_a_batch_are_written_if_it_had_no_value() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     for (existed, next) in [(true, None), (false, Some(Work::NamesOf(3)))] {
         let mut store = up(now);
         let then = Some(Work::NamesOf(3));
@@ -143,7 +145,7 @@ fn names_of_a_batch_are_written_if_it_had_no_value() {
 
 #[test]
 fn work_whose_writes_fail_is_repeated_once_and_later_each_time() {
-    let mut now = Instant::now();
+    let mut now = Clock::default().now().instant;
     let mut store = up(now);
     for seconds in [1, 2, 4, 8, 16, 32, 32] {
         for number in 0..3 {
@@ -164,7 +166,7 @@ fn work_whose_writes_fail_is_repeated_once_and_later_each_time() {
 
 #[test]
 fn writes_bound_the_work_that_begins() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = up(now);
     store.add_work(Work::Record(1));
     for number in 0..WRITES_MAX as u16 {
@@ -178,7 +180,7 @@ fn writes_bound_the_work_that_begins() {
 
 #[test]
 fn orphan_whose_owner_renewed_meanwhile_is_written_again() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     for renewed in [false, true] {
         let mut store = up(now);
         store.look_up(now, name(1));
@@ -204,7 +206,7 @@ fn orphan_whose_owner_renewed_meanwhile_is_written_again() {
 
 #[test]
 fn value_of_a_name_with_another_length_is_refused() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     for length in [0, 43, 45, 1000] {
         let mut store = up(now);
         store.look_up(now, name(1));
@@ -217,7 +219,7 @@ fn value_of_a_name_with_another_length_is_refused() {
 
 #[test]
 fn news_that_the_store_answers_again_voids_all_that_was_read() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = up(now);
     store.look_up(now, name(1));
     let op = operations(&mut store, now).remove(0);
@@ -230,7 +232,7 @@ fn news_that_the_store_answers_again_voids_all_that_was_read() {
 
 #[test]
 fn work_at_the_return_of_the_store_is_spread() {
-    let now = Instant::now();
+    let now = Clock::default().now().instant;
     let mut store = up(now);
     store.add_paced(now, (0..1000).map(Work::Record));
     let mut begun = 0;
