@@ -2,7 +2,7 @@
 //!
 //! It simulates growing networks of bare routers ([`sgc_testkit::mesh`]) and prints a table for each kind of event.
 //! Times in the tables are of the virtual clock; processor times are of this machine. `--full` goes to 1000 routers,
-//! 100 000 flooded names and a million queried ones. `--sizes 10,30` and `--only flood` or `query` select parts; `--csv
+//! 100 000 flooded names and a million queried ones. `--sizes 10,30` and `--only flood`, `query` or `store` select parts; `--csv
 //! DIR` also writes the tables there.
 #![allow(clippy::print_stdout, reason = "the tables are what it is for")]
 
@@ -75,6 +75,7 @@ struct Tables {
     events: Table,
     flood: Table,
     query: Table,
+    store: Table,
     hub: Table,
 }
 
@@ -142,16 +143,31 @@ impl Tables {
                     "routers that hold some",
                 ],
             ),
+            store: Table::new(
+                "store",
+                &[
+                    "routers",
+                    "names",
+                    "what",
+                    "answered after ms",
+                    "reads",
+                    "writes",
+                    "of names",
+                    "questions",
+                    "other frames",
+                ],
+            ),
             hub: Table::new("hub", &["proxies", "names that they wait for", "KB held", "a search µs"]),
         }
     }
 
-    fn all(&self) -> [(&'static str, &Table); 5] {
+    fn all(&self) -> [(&'static str, &Table); 6] {
         [
             ("Cold start", &self.cold),
             ("Changes", &self.events),
             ("`flood`", &self.flood),
             ("`query`", &self.query),
+            ("`store`", &self.store),
             ("One router with many proxies", &self.hub),
         ]
     }
@@ -366,6 +382,87 @@ fn asking(tables: &mut Tables, routers: usize) {
     tables.cold.row(cold);
 }
 
+/// Measures look-ups, renewals and roaming with a store that all routers share, 1 ms away.
+fn storing(table: &mut Table, routers: usize) {
+    let mut mesh = Mesh::new(routers as u64, MappingKind::Store, cpu);
+    mesh.add_routers(routers);
+    let names = routers * QUERY_NAMES_PER_ROUTER;
+    let batches = names / BATCH_NAMES;
+    let owners: Vec<_> = (0..batches.div_ceil(QUERY_BATCHES))
+        .map(|n| mesh.add_proxy(&format!("owner-{n}"), (1 + 4 * n) % routers))
+        .collect();
+    mesh.start_store();
+    cold_start(&mut mesh);
+    let mut before = mesh.store_counts();
+    let mut row = |mesh: &Mesh, what: &str, after: Option<Duration>, tally: &Tally| {
+        let counts = mesh.store_counts();
+        table.row(vec![
+            routers.to_string(),
+            names.to_string(),
+            what.to_owned(),
+            after.map_or("–".to_owned(), ms),
+            (counts.reads - before.reads).to_string(),
+            (counts.writes - before.writes).to_string(),
+            (counts.name_writes - before.name_writes).to_string(),
+            tally.frames_of_kind("query").to_string(),
+            (tally.frames() - tally.frames_of_kind("query")).to_string(),
+        ]);
+        before = counts;
+    };
+    let advertise_all = |mesh: &mut Mesh| {
+        let mut batch = 0;
+        for owner in &owners {
+            for n in 0..QUERY_BATCHES.min(batches - batch) {
+                mesh.advertise(*owner, n);
+                batch += 1;
+            }
+        }
+        mesh.settle()
+    };
+    let tally = advertise_all(&mut mesh);
+    row(&mesh, "all are advertised", None, &tally);
+    let tally = advertise_all(&mut mesh);
+    row(&mesh, "all are renewed", None, &tally);
+    let home = 1;
+    let farthest = mesh.hops(home).into_iter().max_by_key(|(_, hops)| *hops).map_or(0, |(at, _)| at);
+    let attach = |mesh: &mut Mesh, name: &str| {
+        let proxy = mesh.add_proxy(name, farthest);
+        let cable = mesh.cables_of(proxy)[0];
+        mesh.plug(cable);
+        mesh.settle();
+        proxy
+    };
+    let far = attach(&mut mesh, "far");
+    row(&mesh, "a proxy is attached", None, &Tally::default());
+    let mut ask = |mesh: &mut Mesh, what: &str, name: Name| {
+        mesh.ask(far, name);
+        let tally = mesh.settle();
+        row(mesh, what, tally.heard, &tally);
+    };
+    let name = mesh.names(owners[0], 1)[0];
+    ask(&mut mesh, "a name as far as can be", name);
+    let name = mesh.names(owners[0], 1)[1];
+    ask(&mut mesh, "another of the same batch", name);
+    ask(&mut mesh, "nobody has it", Name([7; 32]));
+    mesh.forget(far, Name([7; 32]));
+    for n in 0..QUESTIONS.min(owners.len() - 1) {
+        let name = mesh.names(owners[n + 1], 0)[0];
+        mesh.ask(far, name);
+    }
+    let tally = mesh.settle();
+    row(&mesh, "ten names of ten owners at once", tally.heard, &tally);
+    let joiner = attach(&mut mesh, "joiner");
+    row(&mesh, "a proxy is attached", None, &Tally::default());
+    let name = mesh.names(owners[owners.len() - 1], 1)[7];
+    mesh.subscribe(joiner, name);
+    let tally = mesh.settle();
+    assert!(tally.granted.is_some(), "not granted");
+    row(&mesh, "look-up and request to join", tally.granted, &tally);
+    mesh.roam(owners[0], routers / 2);
+    let tally = mesh.settle();
+    row(&mesh, "an owner that was asked for roams", None, &tally);
+}
+
 /// Measures names that every router knows.
 fn flooding(table: &mut Table, routers: usize, names: &[usize]) {
     let mut mesh = Mesh::new(routers as u64, MappingKind::Flood, cpu);
@@ -475,19 +572,23 @@ fn main() {
             }
             "--only" => only = args.next(),
             "--csv" => csv = args.next().map(PathBuf::from),
-            _ => panic!("--full, --sizes 10,30, --only flood, --only query or --csv DIR, not {arg}"),
+            _ => panic!("--full, --sizes 10,30, --only flood, query or store, or --csv DIR, not {arg}"),
         }
     }
     // Names take some 150 bytes each.
     let names_max = if full { 100_000_000 } else { 10_000_000 };
     let mut tables = Tables::new();
     for routers in sizes {
-        if only.as_deref() != Some("flood") {
+        let is_wanted = |part: &str| only.as_deref().is_none_or(|only| only == part);
+        if is_wanted("query") {
             asking(&mut tables, routers);
+        }
+        if is_wanted("store") {
+            storing(&mut tables.store, routers);
         }
         let names: Vec<_> =
             [1000, 10_000, 100_000].into_iter().filter(|n| n * routers <= names_max).collect();
-        if only.as_deref() != Some("query") {
+        if is_wanted("flood") {
             flooding(&mut tables.flood, routers, &names);
         }
     }
@@ -527,6 +628,11 @@ mod tests {
             assert!(cell(&tables.events, row, "frames") <= 8.0 * 2.0 * edges);
         }
         assert!(cell(&tables.query, 2, "answered after ms") < 100.0);
+        storing(&mut tables.store, 10);
+        let batches = (10 * QUERY_NAMES_PER_ROUTER / BATCH_NAMES) as f64;
+        assert_eq!(cell(&tables.store, 1, "writes"), batches, "a renewal is one write a batch");
+        assert_eq!(cell(&tables.store, 3, "questions"), 0.0, "the store has it");
+        assert_eq!(cell(&tables.store, 4, "reads"), 0.0, "the batch is at hand");
         flooding(&mut tables.flood, 10, &[1000]);
         assert!(cell(&tables.flood, 0, "frames a batch and link") <= 2.0);
         assert!(cell(&tables.flood, 0, "bytes held a name") < 400.0);

@@ -10,7 +10,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_router::{Limits, LinkId, MappingKind, Neighbour, Output, RouteStats, Router, RouterConfig};
+use sgc_router::{
+    Limits, LinkId, MappingKind, Neighbour, Output, RouteStats, Router, RouterConfig, StoreEvent, StoreOp,
+};
 use sgc_trust::{Identity, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Control, Decode, Encode, Hello, JoinBody, Name, NodeId, Request,
@@ -18,6 +20,8 @@ use sgc_wire::{
 };
 
 use crate::cast::{Member, identity};
+use crate::ids::NodeKey;
+use crate::store::{STORE_LATENCY, SimStore, StoreCounts};
 use crate::{Clock, Dice};
 
 /// Names in one advertisement.
@@ -76,6 +80,7 @@ enum Input {
     Up(LinkId, Neighbour),
     Down(LinkId),
     Frame(LinkId, Bytes),
+    Store(StoreEvent),
     Timeout,
 }
 
@@ -109,6 +114,7 @@ impl Recording {
                     let frame = Control::from_slice(bytes).expect("as it was encoded");
                     router.handle_frame(*now, *link, frame);
                 }
+                Input::Store(event) => router.handle_store(*now, event.clone()),
                 Input::Timeout => router.handle_timeout(*now),
             }
             drain(&mut router, *now);
@@ -136,6 +142,13 @@ struct Cable {
     links: Option<[LinkId; 2]>,
 }
 
+/// Something on its way.
+enum UnderWay {
+    Frame(usize, LinkId, Control),
+    Operation(usize, StoreOp),
+    News(usize, StoreEvent),
+}
+
 /// Many routers, their proxies, and frames in flight between them.
 pub struct Mesh {
     clock: Clock,
@@ -145,7 +158,9 @@ pub struct Mesh {
     stations: Vec<Station>,
     places: Vec<(f64, f64)>,
     cables: Vec<Cable>,
-    under_way: BTreeMap<(Instant, u64), (usize, LinkId, Control)>,
+    under_way: BTreeMap<(Instant, u64), UnderWay>,
+    /// The store, with [`MappingKind::Store`].
+    store: SimStore,
     frames_sent: u64,
     wakes: BTreeSet<(Instant, usize)>,
     recording: Option<(usize, Recording)>,
@@ -167,6 +182,7 @@ impl Mesh {
             places: Vec::new(),
             cables: Vec::new(),
             under_way: BTreeMap::new(),
+            store: SimStore::default(),
             frames_sent: 0,
             wakes: BTreeSet::new(),
             recording: None,
@@ -512,9 +528,42 @@ impl Mesh {
         if let Some((_, station)) = self.wakes.first().copied().filter(|(wake, _)| *wake <= at) {
             return self.input(station, Input::Timeout, None);
         }
-        let Some((_, (station, link, frame))) = self.under_way.pop_first() else { return };
-        self.tally.last_frame = at.saturating_duration_since(self.since);
-        self.input(station, Input::Frame(link, Bytes::new()), Some(frame));
+        match self.under_way.pop_first() {
+            Some((_, UnderWay::Frame(station, link, frame))) => {
+                self.tally.last_frame = at.saturating_duration_since(self.since);
+                self.input(station, Input::Frame(link, Bytes::new()), Some(frame));
+            }
+            Some((_, UnderWay::Operation(station, op))) => self.serve_store(station, &op),
+            Some((_, UnderWay::News(station, event))) => self.input(station, Input::Store(event), None),
+            None => {}
+        }
+    }
+
+    // ---- The store.
+
+    /// Tells all routers that the store answers.
+    pub fn start_store(&mut self) {
+        for station in self.routers() {
+            self.send(STORE_LATENCY, UnderWay::News(station, StoreEvent::Up));
+        }
+    }
+
+    /// Returns the operations of the store so far.
+    pub fn store_counts(&self) -> StoreCounts {
+        self.store.counts
+    }
+
+    fn serve_store(&mut self, station: usize, op: &StoreOp) {
+        let (result, told) = self.store.apply(self.clock.instant(), (NodeKey(station), 0), op);
+        self.send(STORE_LATENCY, UnderWay::News(station, StoreEvent::Reply { id: op.id, result }));
+        for (NodeKey(reader), _) in told {
+            self.send(STORE_LATENCY, UnderWay::News(reader, StoreEvent::Changed(op.key)));
+        }
+    }
+
+    fn send(&mut self, after: Duration, what: UnderWay) {
+        self.frames_sent += 1;
+        self.under_way.insert((self.clock.instant() + after, self.frames_sent), what);
     }
 
     /// Passes an input to a machine. A frame comes as a value.
@@ -536,6 +585,7 @@ impl Mesh {
             (Input::Up(link, neighbour), _) => router.handle_link_up(now, link, neighbour),
             (Input::Down(link), _) => router.handle_link_down(now, link),
             (Input::Frame(link, _), Some(frame)) => router.handle_frame(now, link, frame),
+            (Input::Store(event), _) => router.handle_store(now, event),
             (Input::Frame(..), None) | (Input::Timeout, _) => router.handle_timeout(now),
         }
         let mut outputs = Vec::new();
@@ -556,11 +606,8 @@ impl Mesh {
                 Output::Send { link, frame } => self.carry(station, link, frame),
                 Output::Dropped(dropped) => *self.tally.drops.entry(dropped.reason.key()).or_default() += 1,
                 Output::Close { reason, .. } => panic!("honest nodes close a link: {reason}"),
-                Output::Forward { .. }
-                | Output::Trust(_)
-                | Output::Timeout(_)
-                | Output::Flush { .. }
-                | Output::Store(_) => {}
+                Output::Store(op) => self.send(STORE_LATENCY, UnderWay::Operation(station, op)),
+                Output::Forward { .. } | Output::Trust(_) | Output::Timeout(_) | Output::Flush { .. } => {}
             }
         }
         for frame in local {
@@ -583,12 +630,11 @@ impl Mesh {
     fn carry(&mut self, from: usize, link: LinkId, frame: Control) {
         let Some((cable, side)) = self.stations[from].links.get(&link).copied() else { return };
         let Cable { ends, latency, links: Some(links) } = &self.cables[cable] else { return };
-        let (to, link) = (ends[1 - side], links[1 - side]);
+        let (to, link, latency) = (ends[1 - side], links[1 - side], *latency);
         let (kind, bytes) = weigh(&frame);
         let tally = self.tally.frames.entry(kind).or_default();
         (tally.0, tally.1) = (tally.0 + 1, tally.1 + bytes as u64);
-        self.frames_sent += 1;
-        self.under_way.insert((self.clock.instant() + *latency, self.frames_sent), (to, link, frame));
+        self.send(latency, UnderWay::Frame(to, link, frame));
     }
 
     // ---- The reference model.

@@ -8,11 +8,9 @@ use sgc_router::{MappingKind, StoreEvent, StoreFailure, StoreKey, StoreOp, Store
 use crate::ids::NodeKey;
 use crate::node::Arrival;
 use crate::rng::Dice;
-use crate::store::{Client, StoreCounts, Value};
+use crate::store::{Client, STORE_LATENCY, StoreCounts, Value};
 use crate::world::{Pending, World};
 
-/// Time of an operation to the store, and of its result back.
-const STORE_LATENCY: Duration = Duration::from_millis(1);
 /// Time after which an operation without an answer fails.
 const OPERATION_MAX: Duration = Duration::from_secs(2);
 

@@ -1,12 +1,15 @@
 //! A store that all routers of a world share: a map that reports changes, and that can fail, forget and lie.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_router::{StoreAction, StoreFailure, StoreKey, StoreOp, StoreReply, WriteIf};
 
 use crate::ids::NodeKey;
+
+/// Time of an operation to the store, and of its result back.
+pub(crate) const STORE_LATENCY: Duration = Duration::from_millis(1);
 
 /// A run of a node that uses the store.
 pub(crate) type Client = (NodeKey, u64);

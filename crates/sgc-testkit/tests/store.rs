@@ -105,6 +105,7 @@ fn robot_that_roams_rewrites_no_name() {
     site.world.link(third, site.routers[1]);
     site.until_granted("/chatter");
     site.world.run(Duration::from_secs(220));
+    site.world.capture();
     let roamed = site.counts_of(|site| {
         site.world.cut(site.routers[0], site.robot);
         site.world.link(third, site.robot);
@@ -112,6 +113,9 @@ fn robot_that_roams_rewrites_no_name() {
     });
     assert_eq!(roamed.name_writes, 0);
     assert!((1..=4).contains(&roamed.writes), "its link state as it changes, and its batches: {roamed:?}");
+    let asked =
+        |site: &Site| site.routers.iter().chain([&third]).map(|node| site.questions(*node)).sum::<usize>();
+    assert_eq!(asked(&site), 0, "the store tells its new place");
     site.assert_delivers("/chatter");
     assert_eq!(site.world.next_hop(site.routers[1], &site.world.name(site.robot, "/chatter")), Some(third));
 }

@@ -1,7 +1,7 @@
 //! Asking for names: questions that begin here, and those of other routers.
 
 use std::collections::BTreeMap;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId};
 use smallvec::SmallVec;
@@ -15,6 +15,9 @@ use crate::limits::allowances::Turn;
 use crate::link_id::LinkId;
 use crate::mapping::{Ask, NameLocation};
 use crate::store::{LookUpStart, Work};
+
+/// Time for which the new place of an owner is waited for, before routers beside the store are asked for it.
+const PLACE_WAIT: Duration = Duration::from_secs(2);
 
 impl Names {
     /// Handles a question. The answer goes back over the link that brought the question first: copies over others are
@@ -141,6 +144,18 @@ impl Names {
                 cx.send(link, Control::Query { id, hops: 0, names: chunk.to_vec() });
             }
         }
+    }
+
+    /// Notes that a name was found in the store. Returns `true` if other routers are to be asked all the same: its owner
+    /// is out of reach, and was so a moment ago.
+    pub(crate) fn found_in_store(&mut self, cx: &Context<'_>, name: Name) -> bool {
+        let was_unplaced = self.unplaced.remove(&name);
+        if was_unplaced || self.questions.due(&name).is_none() || self.next_hop(cx.network, &name).is_some() {
+            return was_unplaced;
+        }
+        self.unplaced.insert(name);
+        self.questions.ask_again(name, cx.now.instant + PLACE_WAIT);
+        false
     }
 
     /// Asks all routers for names that the store does not have, or did not tell in time, if somebody here waits for

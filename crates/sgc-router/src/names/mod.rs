@@ -52,6 +52,8 @@ pub(crate) struct Names {
     heard: Heard,
     interests: Interests,
     questions: Questions,
+    /// Names that the store has and whose owners are out of reach: their new places may be on their way.
+    unplaced: BTreeSet<Name>,
     /// Names of this node that are not told over a direct link, because more than one copy would pass the uplink.
     withheld: Withheld,
 }
@@ -112,6 +114,7 @@ impl Names {
             heard: Heard::default(),
             interests: Interests::default(),
             questions: Questions::new(config.incarnation, limits),
+            unplaced: BTreeSet::new(),
             withheld: Withheld::default(),
         }
     }
@@ -496,6 +499,7 @@ impl Names {
         }
         self.withheld.forget(link, name);
         self.questions.stop_asking(name);
+        self.unplaced.remove(name);
         let next_hop = |names: &Self| names.next_hop(cx.network, name);
         if !self.transit && next_hop(self).is_none_or(|(link, _)| link != LinkId::LOCAL) {
             self.heard.remove(name);

@@ -66,8 +66,9 @@ impl Router {
             Finding::Changed(key) => self.store_changed(key),
             Finding::Signed { key, value } => self.take_signed(key, &value),
             Finding::LookedUp { name, end, others_asked } => {
-                self.check_found(&name, end);
-                return (!others_asked).then_some(name);
+                let is_found = self.check_found(&name, end);
+                let asks = !is_found || self.names_part(|names, cx| names.found_in_store(cx, name));
+                return (asks && !others_asked).then_some(name);
             }
         }
         None
@@ -111,13 +112,14 @@ impl Router {
         }
     }
 
-    /// Refuses the values that led to a name if no announcement of its owner has the name.
-    fn check_found(&mut self, name: &Name, end: LookUpEnd) {
-        if let LookUpEnd::Found(entry) = end
-            && !self.names.is_announced_by(name, &entry.owner)
-        {
+    /// Returns `true` if a name was found. Refuses the values that led to it if no announcement of its owner has the name.
+    fn check_found(&mut self, name: &Name, end: LookUpEnd) -> bool {
+        let LookUpEnd::Found(entry) = end else { return false };
+        let is_found = self.names.is_announced_by(name, &entry.owner);
+        if !is_found {
             self.refuse_stored(&[StoreKey::Name(*name), entry.batch(), StoreKey::Node(entry.owner)]);
         }
+        is_found
     }
 
     fn refuse_stored(&mut self, keys: &[StoreKey]) {
