@@ -132,8 +132,10 @@ pub(crate) fn resolve(
     let announce = resolver.announce(draft);
     let accept = resolver.accept(draft);
     let attempted = |key| draft.attempted.contains(key);
-    let mapping = draft.mapping.as_ref().and_then(|kind| resolver.keep(kind, mapping)).unwrap_or_default();
-    let store = resolver.store(draft, mapping);
+    let known = draft.mapping.as_ref().map(|kind| resolver.keep(kind, mapping));
+    let mapping = known.flatten().unwrap_or_default();
+    // A mapping that is not understood has an error, so that the settings beside it need none.
+    let store = (known != Some(None)).then(|| resolver.store(draft, mapping)).flatten();
     let peer_rate = draft.peer_rate.as_ref().and_then(|rate| resolver.keep(rate, names::rate));
     let connects = !draft.routers.is_empty() || !draft.listen.is_empty();
     if !connects && !["routers", "listen", "node", "router"].into_iter().any(attempted) {

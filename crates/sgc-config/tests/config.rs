@@ -1923,3 +1923,71 @@ fn policies_are_named_as_in_ros_2_and_contradict_each_other_nowhere() {
     let service = said_about("[[use]]\nfrom = 'b'\nservice = '/a'\nlifespan = '1s'");
     assert!(service.len() == 1 && service[0].contains("`lifespan` is for topics"), "{service:?}");
 }
+
+#[test]
+fn router_keeps_names_in_a_store_by_its_urls() {
+    const ROUTER: &str = "[router]\nlisten = ['quic://0.0.0.0:7447']\n";
+    let of = |text: &str| good(&format!("{NODE}{ROUTER}{text}")).store;
+    assert_eq!(of("mapping = 'query'"), None);
+    let usual = of("mapping = 'store'\nstore = ['valkey://store.example']").unwrap();
+    assert_eq!(usual.servers, ["valkey://store.example:6379".parse().unwrap()]);
+    assert_eq!(
+        (usual.prefix.as_str(), &usual.user, &usual.ca, &usual.certificate),
+        ("sgc", &None, &None, &None)
+    );
+    let own = of("mapping = 'store'\nstore = ['valkeys://a:1', 'rediss://b:2']\nstore_prefix = 'acme'\n\
+         store_user = 'router'\nstore_password_file = 'secret'\nstore_ca = 'ca.pem'\n\
+         store_certificate = 'r.pem'\nstore_key = 'r.key'")
+    .unwrap();
+    let file = |name: &str| Path::new("/etc/sgc").join(name);
+    assert_eq!((own.servers.len(), own.prefix.as_str()), (2, "acme"));
+    assert_eq!(own.user, Some(("router".to_owned(), file("secret"))));
+    assert_eq!((own.ca, own.certificate), (Some(file("ca.pem")), Some((file("r.pem"), file("r.key")))));
+    check_all(&[
+        (
+            "[router]\nmapping = 'store'",
+            &["node.toml:4: `mapping` is \"store\", and `store` does not say where: add it, such as \
+               store = [\"valkey://store.example:6379\"]"],
+        ),
+        (
+            "[router]\nstore = ['valkey://a']\nstore_prefix = 'b'",
+            &[
+                "node.toml:4: `store` is for a store of names: add mapping = \"store\", or take `store` out",
+                "node.toml:5: `store_prefix` is for a store of names: add mapping = \"store\", or take `store_prefix` out",
+            ],
+        ),
+        (
+            "[router]\nmapping = 'stor'\nstore = ['valkey://a']",
+            &[
+                "node.toml:4: `mapping` is \"stor\"; did you mean \"store\"? It takes \"flood\", \"query\", \"store\"",
+            ],
+        ),
+        (
+            "[router]\nmapping = 'store'\nstore = ['http://a', 'valkey://me:secret@a']",
+            &[
+                "node.toml:5: `store`: \"http://a\" is no server of a store: write valkey://HOST:PORT, or \
+                 valkeys://HOST:PORT with TLS",
+                "node.toml:5: `store`: a URL with a user or password ends up in logs: give the user and the file of its \
+                 password apart",
+            ],
+        ),
+        (
+            "[router]\nmapping = 'store'\nstore = ['valkey://a', 'valkeys://b']",
+            &[
+                "node.toml:5: `store` has servers with TLS (valkeys://) and without (valkey://): the password would go \
+               unencrypted",
+            ],
+        ),
+        (
+            "[router]\nmapping = 'store'\nstore = ['valkey://a']\nstore_ca = 'ca.pem'\nstore_user = 'u'",
+            &[
+                "node.toml:6: `store_ca` is for valkeys://, and `store` begins with valkey://: correct one of them",
+                "node.toml:7: `store_user` needs `store_password_file` beside it: add that, or take `store_user` out",
+            ],
+        ),
+        (
+            "[router]\nmapping = 'store'\nstore = ['valkey://a']\nstore_prefix = 'a:b'",
+            &["node.toml:6: `store_prefix`: ':' in a prefix: use letters, digits, '-', '_' and '.'"],
+        ),
+    ]);
+}
