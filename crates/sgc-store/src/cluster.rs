@@ -779,3 +779,105 @@ fn is_state_ok(reply: &Frame) -> bool {
         None => true,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use sgc_router::{StoreKey, StoreOpId, WriteIf};
+    use sgc_testkit::{Clock, Dice};
+    use sgc_wire::Name;
+
+    use super::*;
+    use crate::config::StorePrefix;
+
+    fn config() -> StoreConfig {
+        let servers = ["valkey://a:1", "valkey://b:2"].iter().map(|url| url.parse().unwrap()).collect();
+        StoreConfig::new(servers, StorePrefix::default(), None, None).unwrap()
+    }
+
+    /// Returns a frame as no honest server sends it, or as one may.
+    fn frame(dice: &mut Dice, depth: u32) -> Frame {
+        const TEXTS: [&[u8]; 9] = [
+            b"OK",
+            b"",
+            b"invalidate",
+            b"sgc:n:",
+            b"MOVED 7 a:1",
+            b"MOVED 99999 :0",
+            b"ASK 16383 c:65535",
+            b"CLUSTERDOWN",
+            b"ERR This instance has cluster support disabled",
+        ];
+        let text = |dice: &mut Dice| Bytes::from_static(TEXTS[dice.below(TEXTS.len())]);
+        let elements = |dice: &mut Dice| (0..dice.below(5)).map(|_| frame(dice, depth + 1)).collect();
+        match dice.below(if depth < 4 { 9 } else { 6 }) {
+            0 => Frame::Null,
+            1 => Frame::TooLong,
+            2 => Frame::Integer([0, 1, -1, 16_383, i64::MAX, i64::MIN][dice.below(6)]),
+            3 => Frame::Error(text(dice)),
+            4 | 5 => Frame::Text(text(dice)),
+            6 | 7 => Frame::Array(elements(dice)),
+            _ => Frame::Push(elements(dice)),
+        }
+    }
+
+    /// Whatever servers do, each operation ends in time, with one result, and the machine's memory is bounded.
+    #[test]
+    fn operations_end_once_and_in_time_whatever_servers_send() {
+        for seed in 0..200 {
+            let mut dice = Dice::new(seed);
+            let mut now = Clock::default().now().instant;
+            let mut cluster = Cluster::new(now, &config(), seed);
+            let (mut links, mut under_way, mut next) = (Vec::new(), BTreeMap::new(), 0);
+            for _ in 0..500 {
+                while let Some(output) = cluster.poll_output() {
+                    match output {
+                        Output::Open { link, .. } => links.push(link),
+                        Output::Close { link } => links.retain(|open| *open != link),
+                        Output::Event(StoreEvent::Reply { id, .. }) => {
+                            let begun: Option<Instant> = under_way.remove(&id);
+                            let took = now - begun.expect("one result of each operation");
+                            assert!(took <= OP_TIMEOUT + LOOK_EVERY, "seed {seed}: {took:?}");
+                        }
+                        Output::Event(_) | Output::Send { .. } | Output::Warn(_) | Output::Inform(_) => {}
+                    }
+                }
+                assert!(cluster.servers.len() <= 2 + GUESTS_MAX + 2 * 128, "seed {seed}");
+                match dice.below(10) {
+                    0..3 if cluster.has_room() => {
+                        let key = StoreKey::Name(Name([dice.below(256) as u8; 32]));
+                        let value = Bytes::from_static(b"value");
+                        let action = match dice.below(3) {
+                            0 => StoreAction::Read,
+                            1 => StoreAction::Remove { value },
+                            _ => StoreAction::Write { value, lifetime: None, condition: WriteIf::Always },
+                        };
+                        let id = StoreOpId(next);
+                        next += 1;
+                        under_way.insert(id, now);
+                        cluster.handle_op(now, StoreOp { id, key, action });
+                    }
+                    3..8 => {
+                        let Some(link) = dice.pick(&links) else { continue };
+                        let event = match dice.below(12) {
+                            0..4 => LinkEvent::Ready,
+                            4 => LinkEvent::Closed("gone".to_owned()),
+                            _ => LinkEvent::Frame(frame(&mut dice, 0)),
+                        };
+                        if matches!(event, LinkEvent::Closed(_)) {
+                            links.retain(|open| *open != link);
+                        }
+                        cluster.handle_link(now, link, event);
+                    }
+                    _ => {
+                        let due = cluster.next_timeout(now).max(now);
+                        now = due.min(now + Duration::from_millis(dice.below(300) as u64));
+                        if now >= due {
+                            cluster.handle_timeout(now);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}

@@ -325,6 +325,37 @@ mod tests {
     }
 
     #[test]
+    fn random_bytes_are_read_alike_in_all_pieces() {
+        const PIECES: [&[u8]; 12] = [
+            b"*2\r\n",
+            b"$3\r\nabc\r\n",
+            b":7\r\n",
+            b"_\r\n",
+            b"%1\r\n",
+            b">2\r\n",
+            b"-ERR x\r\n",
+            b"=7\r\ntxt:abc\r\n",
+            b"$99999999999\r\n",
+            b"*-1\r\n",
+            b"\r\n",
+            b"#t\r\n",
+        ];
+        let mut dice = sgc_testkit::Dice::new(1);
+        for _ in 0..20_000 {
+            let mut bytes = Vec::new();
+            for _ in 0..dice.within(1..=8) {
+                bytes.extend_from_slice(PIECES[dice.below(PIECES.len())]);
+            }
+            if dice.chance(50) {
+                let at = dice.below(bytes.len());
+                bytes[at] = dice.below(256) as u8;
+            }
+            // Panics and differences between pieces are the failures.
+            let _ = decode(&bytes);
+        }
+    }
+
+    #[test]
     fn frames_of_all_types_are_read() {
         let bytes = b"+OK\r\n:-7\r\n$3\r\na\r\n\r\n$-1\r\n_\r\n#t\r\n#f\r\n,1.5\r\n-ERR no\r\n!5\r\nERR x\r\n=5\r\ntxt:a\r\n";
         let expected = [
