@@ -44,6 +44,8 @@ pub struct Status {
     pub refused: BTreeMap<String, u64>,
     local_network_reopened: u64,
     router: RouterSize,
+    #[serde(default)]
+    store: Option<Store>,
     gateway: Option<Gateway>,
     metrics: Option<String>,
     otlp: Option<Pushes>,
@@ -205,6 +207,31 @@ struct RouterSize {
     branches: u64,
 }
 
+/// The store of names of a router.
+#[derive(Clone, Debug, Deserialize)]
+struct Store {
+    down_s: Option<u64>,
+    found: u64,
+    absent: u64,
+    operations: u64,
+    failures: u64,
+}
+
+impl Store {
+    fn line(&self) -> Toned {
+        let Self { down_s, found, absent, operations, failures } = self;
+        let (tone, state) = match down_s {
+            None => (Tone::Plain, "answers".to_owned()),
+            Some(seconds) => (Tone::Attention, format!("has not answered for {seconds} s")),
+        };
+        let operations = output::several(*operations, "operation");
+        Toned::new(
+            tone,
+            format!("Store: {state}; {found} names found, {absent} absent; {operations}, {failures} failed"),
+        )
+    }
+}
+
 /// Asks the node at a socket for its status, for programs that show it in another way.
 pub fn query(socket: &Path) -> Result<Status, DiagnosisError> {
     parse(socket, &ask(socket, &AdminRequest::Status, ANSWER_MAX)?)
@@ -323,6 +350,7 @@ impl Status {
         let known =
             format!("Router: {nodes} and {names} known, {routed_names} with a route; branches: {branches}");
         lines.push(known.into());
+        lines.extend(self.store.as_ref().map(|store| Line::new([store.line()])));
         lines
     }
 }
