@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use sgc_gateway::{PageOriginError, ScopeError};
-use sgc_store::{StorePrefixError, StoreServerError};
+use sgc_store::{StorePrefixError, StoreServerError, StoreUserError};
 use sgc_transport::UrlError;
 use sgc_trust::{CertificateNameError, TokenError};
 
@@ -579,6 +579,14 @@ pub enum Mistake {
         key: &'static str,
         /// The fault.
         fault: StorePrefixError,
+    },
+    /// The name of the store's user is wrong.
+    #[error("`{key}`: {fault}")]
+    StoreUser {
+        /// The key.
+        key: &'static str,
+        /// The fault.
+        fault: StoreUserError,
     },
     /// The mapping `store` without a store.
     #[error(

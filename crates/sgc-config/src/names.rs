@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use sgc_gateway::{PageOrigin, PageOriginError};
 use sgc_ros::{Interface, TOPIC_BYTES_MAX};
-use sgc_store::{StorePrefix, StoreServer};
+use sgc_store::{StorePrefix, StoreServer, StoreUser};
 use sgc_transport::{ListenAddr, UrlError};
 use sgc_trust::{CertificateName, FleetName, LABEL_BYTES_MAX, NodeName};
 use sgc_wire::NodeId;
@@ -366,6 +366,11 @@ pub(crate) fn store_server(key: &'static str, value: &str) -> Result<StoreServer
 /// Checks the prefix of the keys in a store.
 pub(crate) fn store_prefix(key: &'static str, value: &str) -> Result<StorePrefix, Mistake> {
     value.parse().map_err(|fault| Mistake::StorePrefix { key, fault })
+}
+
+/// Checks the name of a store's user.
+pub(crate) fn store_user(key: &'static str, value: &str) -> Result<String, Mistake> {
+    StoreUser::check_name(value).map(|()| value.to_owned()).map_err(|fault| Mistake::StoreUser { key, fault })
 }
 
 /// Checks a listen address, `SCHEME://ADDRESS[:PORT]`.

@@ -101,12 +101,14 @@ pub struct FileChecks {
     pub fleet: fn(&'static str, &Path) -> Result<(), Mistake>,
     /// Checks the certificate chain of the gateway.
     pub chain: fn(&'static str, &Path) -> Result<(), Mistake>,
-    /// Checks the private key of the gateway.
+    /// Checks the private key of the gateway, or of a router at its store.
     pub private_key: fn(&'static str, &Path) -> Result<(), Mistake>,
     /// Checks the CAs of a collector of metrics.
     pub roots: fn(&'static str, &Path) -> Result<(), Mistake>,
     /// Checks a file with headers for a collector of metrics.
     pub headers: fn(&'static str, &Path) -> Result<(), Mistake>,
+    /// Checks a file with the password of a store's user.
+    pub password: fn(&'static str, &Path) -> Result<(), Mistake>,
     /// Checks a directory of message definitions.
     pub directory: fn(&'static str, &Path) -> Result<(), Mistake>,
 }
@@ -725,8 +727,10 @@ impl Resolver<'_> {
             }
         }
         let prefix = prefix.as_ref().and_then(|prefix| self.keep(prefix, names::store_prefix));
-        let password_file = password_file.as_ref().and_then(|f| self.path(f, "\"store.password\""));
+        let user = user.as_ref().and_then(|user| self.keep(user, names::store_user));
         let checks = self.checks;
+        let password = checks.map(|checks| checks.password);
+        let password_file = self.checked_file(password_file.as_ref(), "\"store.password\"", password);
         let ca = self.checked_file(ca.as_ref(), "\"store-ca.pem\"", checks.map(|checks| checks.roots));
         let chain = checks.map(|checks| checks.chain);
         let certificate = self.checked_file(certificate.as_ref(), "\"router.pem\"", chain);
@@ -734,7 +738,7 @@ impl Resolver<'_> {
         Some(StoreSettings {
             servers,
             prefix: prefix.unwrap_or_default(),
-            user: user.as_ref().map(|user| user.value.clone()).zip(password_file),
+            user: user.zip(password_file),
             ca,
             certificate: certificate.zip(key),
         })

@@ -69,7 +69,51 @@ fn files_of_a_gateway_are_looked_at() {
     assert!(said[0].contains("no certificate is in it"), "{}", said[0]);
     assert!(said[1].contains("no private key is in it"), "{}", said[1]);
     fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
-    assert!(told()[1].contains("its mode 0644 lets others at the gateway's private key"), "{}", told()[1]);
+    assert!(told()[1].contains("its mode 0644 lets others at the private key"), "{}", told()[1]);
+}
+
+#[test]
+fn files_of_a_store_are_looked_at() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name);
+    let write = |name: &str, text: &str, mode: u32| {
+        fs::write(path(name), text).unwrap();
+        fs::set_permissions(path(name), fs::Permissions::from_mode(mode)).unwrap();
+    };
+    write("x", "nothing", 0o600);
+    write("password", "secret\n", 0o640);
+    write("ca.pem", "nothing", 0o644);
+    let router = "identity = 'x'\n[router]\nlisten = ['quic://127.0.0.1:0']\nmapping = 'store'\n\
+                  store = ['valkeys://store.example']\nstore_user = 'router'\n\
+                  store_password_file = 'password'\nstore_ca = 'ca.pem'\n";
+    fs::write(path("node.toml"), router).unwrap();
+    let told = || -> Vec<String> {
+        let place = format!("{}/", dir.path().display());
+        let errors = load(&path("node.toml"), &no_env).unwrap_err();
+        errors.iter().map(|error| error.to_string().replace(&place, "")).collect()
+    };
+    let said = told();
+    let [exposed, ca] = &said[..] else { panic!("{said:?}") };
+    assert_eq!(
+        exposed,
+        "node.toml:7: `store_password_file` is password: its mode 0640 lets others at the password; `chmod 600 password`"
+    );
+    assert!(
+        ca.starts_with("node.toml:8: `store_ca` is ca.pem") && ca.contains("no certificate is in it"),
+        "{ca}"
+    );
+    write("password", "\n", 0o600);
+    assert!(told()[0].contains("1 to 1024 bytes"), "{:?}", told());
+    write("password", &"a".repeat(100_000), 0o600);
+    assert!(told()[0].contains("1 to 1024 bytes"), "{:?}", told());
+    write("password", "secret\n", 0o600);
+    assert_eq!(told().len(), 1, "{:?}", told());
+    fs::write(path("node.toml"), router.replace("'router'", "'a b'")).unwrap();
+    assert!(
+        told()[0].contains("`store_user`: the name of a store's user has 1 to 255 characters"),
+        "{:?}",
+        told()
+    );
 }
 
 #[test]

@@ -230,18 +230,26 @@ pub enum StoreUserError {
 impl StoreUser {
     /// Takes a name and the content of the file with the password. A line break at its end is no part of the password.
     pub fn new(name: &str, password_file: Vec<u8>) -> Result<Self, StoreUserError> {
-        let mut password = Zeroizing::new(password_file);
+        let password = Self::read_password(password_file)?;
+        Self::check_name(name)?;
+        Ok(Self { name: name.into(), password })
+    }
+
+    /// Returns the password in the content of its file.
+    pub fn read_password(file: Vec<u8>) -> Result<Zeroizing<Vec<u8>>, StoreUserError> {
+        let mut password = Zeroizing::new(file);
         while matches!(password.last(), Some(b'\n' | b'\r')) {
             password.pop();
         }
+        let is_password = !password.is_empty() && password.len() <= PASSWORD_BYTES_MAX;
+        if is_password { Ok(password) } else { Err(StoreUserError::Password) }
+    }
+
+    /// Checks a name.
+    pub fn check_name(name: &str) -> Result<(), StoreUserError> {
         let is_odd = |c: char| c.is_whitespace() || c.is_control();
-        if name.is_empty() || name.len() > USER_BYTES_MAX || name.contains(is_odd) {
-            return Err(StoreUserError::Name);
-        }
-        if password.is_empty() || password.len() > PASSWORD_BYTES_MAX {
-            return Err(StoreUserError::Password);
-        }
-        Ok(Self { name: name.into(), password })
+        let is_name = !name.is_empty() && name.len() <= USER_BYTES_MAX && !name.contains(is_odd);
+        if is_name { Ok(()) } else { Err(StoreUserError::Name) }
     }
 
     /// Returns the name.

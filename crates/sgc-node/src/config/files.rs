@@ -9,6 +9,7 @@ use std::path::Path;
 use rustls_pki_types::PrivateKeyDer;
 use rustls_pki_types::pem::PemObject as _;
 use sgc_config::{FileChecks, IdentityFile, Mistake};
+use sgc_store::StoreUser;
 use sgc_trust::{ShareToken, TOKEN_TEXT_BYTES_MAX};
 
 use crate::control::fleet::partners;
@@ -17,6 +18,9 @@ use crate::state;
 
 /// Largest file of certificates or of a key for TLS, bytes.
 pub(crate) const PEM_BYTES_MAX: u64 = 256 * 1024;
+
+/// Largest file of a password, bytes: more than any password has.
+const PASSWORD_FILE_BYTES_MAX: u64 = 4096;
 
 /// The checks of [`super::load`].
 pub(super) const FILES: FileChecks = FileChecks {
@@ -28,6 +32,7 @@ pub(super) const FILES: FileChecks = FileChecks {
     private_key: check_private_key,
     roots: check_roots,
     headers: check_headers,
+    password: check_password,
     directory: check_directory,
 };
 
@@ -96,7 +101,7 @@ fn check_certificates(key: &'static str, path: &Path, expected: &'static str) ->
 }
 
 fn check_private_key(key: &'static str, path: &Path) -> Result<(), Mistake> {
-    private(key, path, "the gateway's private key")?;
+    private(key, path, "the private key")?;
     let read = fs::File::open(path).and_then(|file| {
         let mut pem = zeroize::Zeroizing::new(Vec::with_capacity(PEM_BYTES_MAX as usize));
         file.take(PEM_BYTES_MAX).read_to_end(&mut pem).map(|_| pem)
@@ -106,7 +111,22 @@ fn check_private_key(key: &'static str, path: &Path) -> Result<(), Mistake> {
         Ok(_) => "no private key is in it".to_owned(),
         Err(error) => error.to_string(),
     };
-    let expected = "the private key of `certificate` in PEM, without a password";
+    let expected = "the private key of the certificate in PEM, without a password";
+    Err(Mistake::File { key, path: path.to_owned(), reason, expected })
+}
+
+fn check_password(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    private(key, path, "the password")?;
+    let read = fs::File::open(path).and_then(|file| {
+        let mut password = Vec::new();
+        file.take(PASSWORD_FILE_BYTES_MAX).read_to_end(&mut password).map(|_| password)
+    });
+    let reason = match read.map(StoreUser::read_password) {
+        Ok(Ok(_)) => return Ok(()),
+        Ok(Err(error)) => error.to_string(),
+        Err(error) => error.to_string(),
+    };
+    let expected = "a file with nothing but the password of the store's user";
     Err(Mistake::File { key, path: path.to_owned(), reason, expected })
 }
 
