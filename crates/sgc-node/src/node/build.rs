@@ -293,7 +293,6 @@ fn bulk_lanes(config: &Config, addr: &ListenAddr) -> BulkLanes {
     }
 }
 
-/// The machines that the control task owns.
 /// Returns `true` for a node that carries names of others.
 fn is_router(config: &Config, identity: &Identity) -> bool {
     !config.listen.is_empty() && identity.as_peer().may_route
@@ -308,6 +307,7 @@ async fn open_store(config: &Config, identity: &Identity) -> Result<Option<Store
     Ok(Some(loaded.map_err(|_| NodeError::Panicked)??))
 }
 
+/// The machines that the control task owns.
 struct Machines {
     router: Router,
     endpoint: Endpoint,
