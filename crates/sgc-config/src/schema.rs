@@ -183,8 +183,6 @@ impl Table {
                 "listen",
                 "peer_rate",
                 "mapping",
-                "announce",
-                "accept",
                 "store",
                 "store_prefix",
                 "store_user",
@@ -192,6 +190,8 @@ impl Table {
                 "store_ca",
                 "store_certificate",
                 "store_key",
+                "announce",
+                "accept",
             ],
             Self::Transport => {
                 &["congestion", "offload", "mtu_discovery", "bulk_lanes", "dtls_1_2", "dscp", "lane_dscp"]

@@ -480,6 +480,13 @@ mod tests {
     }
 
     #[test]
+    fn page_about_stores_names_the_rights_that_a_router_needs() {
+        let page = include_str!("../../../docs/how-to/store-of-names.md").replace("\\\n", " ");
+        let words = page.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(words.contains(&format!("-@all {ACL_COMMANDS}")), "{ACL_COMMANDS}");
+    }
+
+    #[test]
     fn versions_are_compared_by_number() {
         let is_enough = |text: &str| match version(&server(), text) {
             Some(StoreFinding::Version { is_enough, .. }) => is_enough,

@@ -4,7 +4,7 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::LevelFilter;
 
 /// The log targets: the names of the crates that log.
-const LOG_TARGETS: [&str; 16] = [
+const LOG_TARGETS: [&str; 17] = [
     "sgc",
     "sgc_cdr",
     "sgc_dds",
@@ -16,6 +16,7 @@ const LOG_TARGETS: [&str; 16] = [
     "sgc_node",
     "sgc_ros",
     "sgc_router",
+    "sgc_store",
     "sgc_sync",
     "sgc_transport",
     "sgc_trust",
