@@ -51,6 +51,12 @@ const PUBLISHED: usize = 500;
 const WATCHED: usize = 256;
 /// Pause before reads that failed are repeated.
 const REPEAT_AFTER: Duration = Duration::from_millis(20);
+/// Failures of operations at which a run ends.
+const FAILURES_MAX: usize = 100_000;
+/// Time after which servers take another for failed: the default of Redis while the store is filled, so that load is no
+/// failure, and a shorter one when servers are killed.
+const LOADED_TIMEOUT_MS: &str = "15000";
+const KILLED_TIMEOUT_MS: &str = "1000";
 /// Longest wait for an event.
 const WAIT_MAX: Duration = Duration::from_secs(30);
 /// The link of the node that asks or publishes.
@@ -224,28 +230,35 @@ impl Client {
         began.elapsed()
     }
 
-    /// Carries operations out, at most `most` at a time, as `next` gives them; `then` takes each result.
+    /// Carries operations out, at most `most` at a time, as `next` gives them, and those that fail again, as routers do;
+    /// `then` takes each result. Returns the numbers of operations and of failures.
     async fn all<T>(
         &mut self,
         most: usize,
         mut next: impl FnMut() -> Option<(StoreKey, StoreAction, T)>,
         mut then: impl FnMut(T, StoreReply),
-    ) -> usize {
+    ) -> (usize, usize) {
         let mut under_way = BTreeMap::new();
-        let mut done = 0;
+        let (mut done, mut failures) = (0, 0);
         loop {
             while under_way.len() < most
                 && let Some((key, action, about)) = next()
             {
-                under_way.insert(self.begin(key, action), about);
+                under_way.insert(self.begin(key, action.clone()), (key, action, about));
             }
             if under_way.is_empty() {
-                return done;
+                return (done, failures);
             }
             let (id, reply) = self.reply().await;
-            let about = under_way.remove(&id).expect("an operation that is under way");
-            then(about, reply.expect("the store carries it out"));
-            done += 1;
+            let (key, action, about) = under_way.remove(&id).expect("an operation that is under way");
+            if let Some(reply) = reply {
+                then(about, reply);
+                done += 1;
+            } else {
+                failures += 1;
+                assert!(failures < FAILURES_MAX, "the store fails all the time");
+                under_way.insert(self.begin(key, action.clone()), (key, action, about));
+            }
         }
     }
 }
@@ -258,7 +271,7 @@ enum Step {
 }
 
 /// Writes all names: a batch, its names once the store says that it did not have the batch, and owners' link states.
-async fn fill(client: &mut Client, fleet: &Fleet) -> usize {
+async fn fill(client: &mut Client, fleet: &Fleet) -> (usize, usize) {
     let named = std::cell::RefCell::new(VecDeque::new());
     let mut batch = 0;
     let mut owners = 0;
@@ -287,9 +300,8 @@ async fn fill(client: &mut Client, fleet: &Fleet) -> usize {
         Some((key, action, Step::Batch(batch - 1)))
     };
     client
-        .all(OPS_MAX, next, |step, reply| {
+        .all(OPS_MAX, next, |step, _| {
             if let Step::Batch(batch) = step {
-                assert_eq!(reply, StoreReply::Written { existed: false });
                 named.borrow_mut().push_back((batch, 0));
             }
         })
@@ -571,6 +583,9 @@ async fn until_all_are_read(client: &mut Client, fleet: &Fleet, began: Instant) 
 }
 
 async fn recover(client: &mut Client, redis: &mut Redis, fleet: &Fleet) {
+    for index in 0..HOSTS.len() {
+        redis.cli(index, &["CONFIG", "SET", "cluster-node-timeout", KILLED_TIMEOUT_MS]);
+    }
     let (undisturbed, _) = until_all_are_read(client, fleet, Instant::now()).await;
     row(&format!("{WATCHED} reads at once before"), millis(undisturbed));
     let began = Instant::now();
@@ -593,13 +608,14 @@ async fn measure(config: StoreConfig, redis: &mut Redis, fleet: &Fleet, unix: Un
     let mut client = Client::start(config.clone()).await;
     let before = memory(redis);
     let began = Instant::now();
-    let writes = fill(&mut client, fleet).await;
+    let (writes, failures) = fill(&mut client, fleet).await;
     let filled = began.elapsed();
     let names = fleet.batches * BATCH_NAMES;
     row("names", names);
     row("batches of 256, their bytes each", format!("{}, {}", fleet.batches, fleet.signed[0].value.len()));
     row("filled in", format!("{:.1} s", filled.as_secs_f64()));
     row("writes a second", rate(writes, filled));
+    row("writes that failed and were repeated", failures);
     row("names a second", rate(names, filled));
     row("bytes of the primaries a name", format!("{:.0}", (memory(redis) - before) as f64 / names as f64));
 
@@ -612,7 +628,7 @@ async fn measure(config: StoreConfig, redis: &mut Redis, fleet: &Fleet, unix: Un
         })
     };
     let then = |(), reply| assert_eq!(reply, StoreReply::Written { existed: true });
-    let renewed = client.all(512, next, then).await;
+    let (renewed, _) = client.all(512, next, then).await;
     row("renewals a second (goal: 10⁷ names take at most 500)", rate(renewed, began.elapsed()));
     let each_s = LEASE.as_secs_f64() / 3.0;
     row("renewals a second that 10⁷ names need", format!("{:.0}", 1e7 / BATCH_NAMES as f64 / each_s));
@@ -643,6 +659,7 @@ fn main() {
     let folder = tempfile::tempdir().expect("a folder");
     let options = RedisOptions {
         program: std::env::var("SGC_REDIS_SERVER").unwrap_or_else(|_| "redis-server".into()),
+        settings: ["--cluster-node-timeout", LOADED_TIMEOUT_MS].map(str::to_owned).to_vec(),
         ..RedisOptions::default()
     };
     let mut redis = Redis::cluster(store, folder.path(), &HOSTS, options);
