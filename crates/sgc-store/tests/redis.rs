@@ -4,17 +4,21 @@
 
 #![allow(missing_docs, clippy::unwrap_used)]
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
 use sgc_router::{
     BatchTag, StoreAction, StoreEvent, StoreFailure, StoreKey, StoreOp, StoreOpId, StoreReply, WriteIf,
 };
-use sgc_store::{Severity, StoreConfig, StoreFinding, StorePrefix, StoreServer, StoreUser, check, run};
+use sgc_store::{
+    Severity, StoreConfig, StoreFinding, StorePrefix, StoreServer, StoreTls, StoreUser, check, run,
+};
 use sgc_testkit::netsim::Namespace;
-use sgc_testkit::redis::{Redis, RedisOptions, is_redis_installed};
+use sgc_testkit::redis::{Redis, RedisOptions, RedisTls, is_redis_installed};
 use sgc_wire::{Name, NodeId};
 use tempfile::TempDir;
 use tokio::sync::mpsc;
@@ -34,7 +38,7 @@ struct Lab {
 }
 
 impl Lab {
-    fn new(make: impl FnOnce(Arc<Namespace>, &std::path::Path, RedisOptions) -> Redis) -> Self {
+    fn new(make: impl FnOnce(Arc<Namespace>, &Path, RedisOptions) -> Redis) -> Self {
         assert!(is_redis_installed(), "no redis-server: scripts/install-deps.sh test");
         let number = LABS.fetch_add(1, Ordering::SeqCst);
         let name = |place| format!("sgcst-{}-{number}-{place}", std::process::id());
@@ -577,6 +581,79 @@ fn server_that_lies_costs_failed_operations_and_nothing_else() {
             assert!(begin.elapsed() < Duration::from_secs(5), "{answer:?}: {:?}", begin.elapsed());
             client.end().await;
             server.abort();
+        }
+    });
+}
+
+/// The certificates of a test: a CA, one for all servers, and one for the router.
+struct Certificates {
+    ca: String,
+    servers: [String; 2],
+    router: [String; 2],
+}
+
+impl Certificates {
+    fn new() -> Self {
+        let ca_key = KeyPair::generate().unwrap();
+        let mut params = CertificateParams::new(Vec::new()).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        // OpenSSL takes a certificate whose issuer has its own name for one that signs itself.
+        params.distinguished_name.push(DnType::CommonName, "CA of a store");
+        let ca = params.self_signed(&ca_key).unwrap().pem();
+        let issuer = Issuer::new(params, ca_key);
+        let leaf = |names: &[&str]| {
+            let key = KeyPair::generate().unwrap();
+            let names = names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+            let certificate = CertificateParams::new(names).unwrap().signed_by(&key, &issuer).unwrap();
+            [certificate.pem(), key.serialize_pem()]
+        };
+        Self { servers: leaf(&HOSTS), router: leaf(&["router"]), ca }
+    }
+
+    fn write(&self, folder: &Path) -> RedisTls {
+        let write = |name: &str, text: &str| {
+            let path = folder.join(name);
+            std::fs::write(&path, text).unwrap();
+            path
+        };
+        RedisTls {
+            ca: write("ca.pem", &self.ca),
+            certificate: write("server.pem", &self.servers[0]),
+            key: write("server.key", &self.servers[1]),
+        }
+    }
+
+    fn config(&self, urls: &[String], own: Option<&[String; 2]>) -> StoreConfig {
+        let own = own.map(|[certificate, key]| (certificate.as_bytes(), key.as_bytes()));
+        let tls = StoreTls::new(Some(self.ca.as_bytes()), own).unwrap();
+        let servers = urls.iter().map(|url| StoreServer::parse(url).unwrap()).collect();
+        StoreConfig::new(servers, StorePrefix::default(), None, Some(tls)).unwrap()
+    }
+}
+
+#[test]
+fn servers_with_tls_take_the_routers_of_their_ca_and_no_others() {
+    let certificates = Certificates::new();
+    let mut lab = Lab::new(|namespace, folder, options| {
+        let options = RedisOptions { tls: Some(certificates.write(folder)), ..options };
+        Redis::cluster(namespace, folder, &HOSTS, options)
+    });
+    let urls = lab.redis.urls()[..1].to_vec();
+    assert!(urls[0].starts_with("valkeys://"), "{urls:?}");
+    let good = certificates.config(&urls, Some(&certificates.router));
+    lab.client_with(good.clone(), async |client, _| {
+        all_operations(client).await;
+        let report = check(good.clone()).await;
+        assert_eq!(report.severity(), Severity::Fits, "{report:#?}");
+        let strangers = Certificates::new();
+        let refused = [
+            certificates.config(&urls, None),
+            certificates.config(&urls, Some(&strangers.router)),
+            strangers.config(&urls, Some(&certificates.router)),
+        ];
+        for config in refused {
+            let report = check(config).await;
+            assert!(matches!(report.findings[..], [StoreFinding::ServerFails { .. }]), "{report:#?}");
         }
     });
 }

@@ -14,6 +14,9 @@ use crate::store::{
     encode_signed,
 };
 
+/// Least lifetime of a value that is worth a write.
+const LIFETIME_MIN: Duration = Duration::from_millis(1);
+
 impl Router {
     /// Takes news from the store. Has no effect at a router without one.
     pub fn handle_store(&mut self, now: Now, event: StoreEvent) {
@@ -181,8 +184,9 @@ impl Router {
                 }
                 // A withdrawn name ends with its withdrawal.
                 let lifetime = (record.kind() == RecordKind::Withdrawal).then_some(lifetime);
+                let value = entry.to_bytes();
                 for name in self.names.live_names(id) {
-                    store.write(StoreKey::Name(name), entry.to_bytes(), lifetime, work, None);
+                    store.write(StoreKey::Name(name), value.clone(), lifetime, work, None);
                 }
             }
             Work::Check(name) => {
@@ -195,6 +199,3 @@ impl Router {
         }
     }
 }
-
-/// Least lifetime of a value that is worth a write.
-const LIFETIME_MIN: Duration = Duration::from_millis(1);
