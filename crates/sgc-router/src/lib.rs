@@ -46,4 +46,4 @@ pub use store::{
     BATCH_TAG_LEN, BatchTag, STORE_VALUE_BYTES_MAX, StoreAction, StoreEvent, StoreFailure, StoreKey, StoreOp,
     StoreOpId, StoreReply, StoreStats, WriteIf,
 };
-pub use topology::RouteStats;
+pub use topology::{Path, RouteStats, ShortestPaths};

@@ -127,6 +127,7 @@ impl Names {
     }
 
     /// Iterates over the owners of records.
+    #[cfg(test)]
     pub(crate) fn owners(&self) -> impl Iterator<Item = &NodeId> {
         self.records.owners()
     }

@@ -126,6 +126,7 @@ impl Records {
     }
 
     /// Iterates over the owners of records.
+    #[cfg(test)]
     pub(super) fn owners(&self) -> impl Iterator<Item = &NodeId> {
         self.owners.keys()
     }

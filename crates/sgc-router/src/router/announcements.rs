@@ -237,7 +237,7 @@ impl Router {
             let names = self.names.watched().chain(self.trees.names()).copied().collect();
             return self.check_next_hops(names);
         }
-        let owners = self.topology.search(self.now.instant, self.names.owners());
+        let owners: Vec<_> = self.topology.search(self.now.instant).into_iter().collect();
         // Names without an advertisement have no route before or after.
         let counts = |name: &&Name| self.names.is_watched(name) || self.trees.contains(name);
         let names = owners.iter().flat_map(|owner| self.names.names_of(owner).filter(counts)).copied();

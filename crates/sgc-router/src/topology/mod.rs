@@ -5,8 +5,8 @@
 //!
 //! This part verifies nothing: the router does that first.
 
+mod paths;
 mod record;
-mod spf;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
@@ -16,8 +16,8 @@ use std::time::{Duration, Instant};
 use sgc_trust::{CertId, Identity, SignedError, VerifiedLinkState, next_seq, signed_digest};
 use sgc_wire::{Adjacency, LinkStateBody, NodeId, NodeTag, Now, SignedBody, UnixMillis};
 
+pub use self::paths::{Path, ShortestPaths};
 pub(crate) use self::record::NodeRecord;
-use self::spf::{Path, shortest_paths};
 use crate::config::RouterConfig;
 use crate::drops::DropReason;
 use crate::lease::lease_end;
@@ -104,7 +104,7 @@ pub(crate) struct Topology {
     memory: Memory,
     /// Nodes whose link states wait for their allowance to be passed on.
     late: BTreeSet<NodeId>,
-    paths: BTreeMap<NodeId, Path>,
+    paths: ShortestPaths,
     /// Changes since the last search.
     changes: Changes,
     /// Names whose routes were checked again after a search.
@@ -136,7 +136,7 @@ impl Topology {
             seen: BTreeMap::new(),
             memory: Memory::default(),
             late: BTreeSet::new(),
-            paths: BTreeMap::new(),
+            paths: ShortestPaths::new(config.node),
             changes: Changes::default(),
             names_checked: 0,
             search_at: None,
@@ -219,16 +219,16 @@ impl Topology {
         old: Option<&NodeRecord>,
         new: Option<&NodeRecord>,
     ) {
-        let says = |record: Option<&NodeRecord>| record.map(|r| (r.transit, r.routers.clone()));
+        let same = old.map(|r| (r.transit, &r.routers)) == new.map(|r| (r.transit, &r.routers));
         let attached = |record: Option<&NodeRecord>| {
             record.into_iter().flat_map(|r| &r.attached).copied().collect::<BTreeSet<_>>()
         };
         let (before, after) = (attached(old), attached(new));
-        let same = says(old) == says(new);
         if same && before == after {
             return;
         }
         self.changes.attached.extend(before.symmetric_difference(&after));
+        self.edges_changed(node, old, new);
         // The search handles edges between routers.
         let is_router = |record: Option<&NodeRecord>| record.is_some_and(|r| r.transit);
         let edges_only = is_router(old) && is_router(new);
@@ -236,6 +236,18 @@ impl Topology {
             self.changes.nodes.insert(*node);
         }
         self.touch(now);
+    }
+
+    /// Gives the edges of a node to the paths: those to routers that list it, too.
+    fn edges_changed(&mut self, node: &NodeId, old: Option<&NodeRecord>, new: Option<&NodeRecord>) {
+        let listed = [old, new].into_iter().flatten().flat_map(|r| r.routers.iter().map(|a| a.node));
+        for other in listed.filter(|other| other != node) {
+            let Some(back) = self.nodes.get(&other).and_then(|r| r.cost_to_router(node)) else { continue };
+            let costs = |record: Option<&NodeRecord>| Some([record?.cost_to_router(&other)?, back]);
+            if costs(old) != costs(new) {
+                self.paths.set_edge(node, &other, costs(new));
+            }
+        }
     }
 
     fn touch(&mut self, now: Instant) {
@@ -267,7 +279,7 @@ impl Topology {
     /// Returns the results of the route searches.
     pub(crate) fn route_stats(&self) -> RouteStats {
         RouteStats {
-            routers: self.paths.len(),
+            routers: self.paths.reached(),
             searches: self.searches,
             changed: self.routes_changed,
             names_checked: self.names_checked,
@@ -279,7 +291,7 @@ impl Topology {
     pub(crate) fn is_elsewhere(&self, node: &NodeId, started: UnixMillis) -> bool {
         let Some(record) = self.nodes.get(node).filter(|r| r.floor > started.0) else { return false };
         let says = |at: &Adjacency| self.nodes.get(&at.node).is_some_and(|r| r.says(node, record.transit));
-        record.routers.iter().any(|at| at.node != self.own && self.paths.contains_key(&at.node) && says(at))
+        record.routers.iter().any(|at| at.node != self.own && self.paths.get(&at.node).is_some() && says(at))
     }
 
     // ---- Searches for routes.
@@ -300,52 +312,36 @@ impl Topology {
         self.names_checked += names as u64;
     }
 
-    /// Searches for the routes to all routers. Returns these owners' ids whose routes may have changed.
-    pub(crate) fn search<'a>(
-        &mut self,
-        now: Instant,
-        owners: impl Iterator<Item = &'a NodeId>,
-    ) -> Vec<NodeId> {
+    /// Searches for the routes to all routers. Returns the nodes whose routes may have changed.
+    pub(crate) fn search(&mut self, now: Instant) -> BTreeSet<NodeId> {
         self.search_at = None;
         self.searched = Some(now);
-        let nodes = &self.nodes;
-        let edges = |from: &NodeId| {
-            let from = *from;
-            let record = nodes.get(&from).filter(|r| r.transit);
-            record.into_iter().flat_map(|r| &r.routers).filter_map(move |a| {
-                let back = nodes.get(&a.node).filter(|r| r.transit)?.says(&from, true);
-                back.then_some((a.node, a.cost))
-            })
-        };
-        let paths = shortest_paths(self.own, &self.paths, edges);
+        let mut routers = self.paths.search();
         self.searches += 1;
-        if paths != self.paths {
+        if !routers.is_empty() {
             self.routes_changed = Some(now);
         }
-        let before = std::mem::replace(&mut self.paths, paths);
-        let Changes { mut nodes, attached } = std::mem::take(&mut self.changes);
-        let moved = |node: &NodeId| {
-            let path = self.paths.get(node);
-            path != before.get(node) || path.is_some_and(|p| nodes.contains(&p.first))
-        };
-        let routers: BTreeSet<_> = self
-            .paths
-            .keys()
-            .chain(before.keys())
-            .filter(|n| nodes.contains(*n) || moved(n))
-            .copied()
-            .collect();
-        if attached.is_empty() && routers.is_empty() {
-            return nodes.into_iter().collect();
+        let Changes { mut nodes, mut attached } = std::mem::take(&mut self.changes);
+        for node in &nodes {
+            routers.extend(self.paths.get(node).map(|_| *node));
+            routers.extend(self.paths.behind(node));
         }
-        nodes.extend(&routers);
-        let concerned = |owner: &NodeId| {
-            let over = || self.nodes.get(owner).into_iter().flat_map(|r| &r.routers);
-            nodes.contains(owner)
-                || attached.contains(&owner.tag())
-                || over().any(|at| routers.contains(&at.node))
-        };
-        owners.filter(|owner| concerned(owner)).copied().collect()
+        for router in routers {
+            nodes.insert(router);
+            attached.extend(self.nodes.get(&router).into_iter().flat_map(|r| &r.attached));
+        }
+        for tag in &attached {
+            nodes.extend(self.with_tag(tag));
+        }
+        nodes
+    }
+
+    /// Iterates over the known nodes with this tag.
+    fn with_tag(&self, tag: &NodeTag) -> impl Iterator<Item = NodeId> {
+        let (mut first, mut last) = ([0; 32], [u8::MAX; 32]);
+        first[..tag.0.len()].copy_from_slice(&tag.0);
+        last[..tag.0.len()].copy_from_slice(&tag.0);
+        self.nodes.range(NodeId(first)..=NodeId(last)).map(|(node, _)| *node)
     }
 
     // ---- Link states that come.

@@ -43,6 +43,12 @@ impl NodeRecord {
         self.issued_at
     }
 
+    /// Returns the cost of the link to another router; `None` if one of both is no router, or if there is no link.
+    pub(super) fn cost_to_router(&self, node: &NodeId) -> Option<u32> {
+        let at = self.routers.binary_search_by(|a| a.node.cmp(node)).ok()?;
+        self.transit.then(|| self.routers[at].cost)
+    }
+
     /// Returns `true` if it lists a node, a router or another one.
     pub(super) fn says(&self, node: &NodeId, transit: bool) -> bool {
         if transit {
