@@ -21,6 +21,8 @@ pub const REDIS_PORT: u16 = 6379;
 const START_MAX: Duration = Duration::from_secs(20);
 /// The time after which servers of a cluster take another for failed.
 pub const NODE_TIMEOUT: Duration = Duration::from_millis(1000);
+/// Lines of each log that are shown after a failure.
+const LOG_LINES_SHOWN: usize = 10;
 /// Most keys of a slot that are moved.
 const KEYS_AT_ONCE: &str = "1000";
 /// The table of nftables with the addresses that are cut off.
@@ -288,11 +290,21 @@ impl Redis {
         self.namespace.run("nft", &["-f", &file.display().to_string()]).expect("nft takes the rules");
     }
 
+    /// Returns the ends of the servers' logs.
+    fn logs(&self) -> String {
+        let log = |server: &Server| {
+            let text = fs::read_to_string(self.folder.join(&server.host).join("log")).unwrap_or_default();
+            let lines: Vec<&str> = text.lines().rev().take(LOG_LINES_SHOWN).collect();
+            lines.into_iter().rev().map(|line| format!("{}: {line}\n", server.host)).collect::<String>()
+        };
+        self.servers.iter().map(log).collect()
+    }
+
     /// Waits for a condition.
     pub fn until(&self, what: &str, mut condition: impl FnMut(&Self) -> bool) {
         let deadline = Instant::now() + START_MAX;
         while !condition(self) {
-            assert!(Instant::now() < deadline, "not within {START_MAX:?}: {what}");
+            assert!(Instant::now() < deadline, "not within {START_MAX:?}: {what}\n{}", self.logs());
             sleep(Duration::from_millis(20));
         }
     }
