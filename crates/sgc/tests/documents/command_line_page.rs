@@ -90,7 +90,10 @@ fn leaves<'c>(command: &'c Command, name: &str) -> Vec<(String, &'c Command)> {
     let shown = command.get_subcommands().filter(|below| !below.is_hide_set() && below.get_name() != "help");
     let below: Vec<_> =
         shown.flat_map(|below| leaves(below, &format!("{name} {}", below.get_name()))).collect();
-    if below.is_empty() { vec![(name.to_owned(), command)] } else { below }
+    // `sgc router` runs a router, and has other commands below it.
+    let is_leaf = below.is_empty() || command.is_subcommand_negates_reqs_set();
+    let own = is_leaf.then(|| (name.to_owned(), command));
+    own.into_iter().chain(below).collect()
 }
 
 /// Returns the line of an argument.
