@@ -1,5 +1,9 @@
 //! Routers that keep names in a store: a `redis-server` of the test's own, which is killed and returns empty.
 
+use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+
 use serde_json::Value;
 use sgc_testkit::redis::{Redis, RedisOptions, is_redis_installed};
 
@@ -25,6 +29,17 @@ fn keys(redis: &Redis) -> usize {
     redis.cli(0, &["DBSIZE"]).trim().trim_start_matches("(integer) ").parse().unwrap()
 }
 
+/// Returns the rest of the configurations of a robot that shares all topics and a desk that uses them.
+fn rules(robot: &str, desk: &str) -> (String, String) {
+    let [mut shares, mut uses] =
+        ["direct = \"never\"\n[ros]\ndomain_id = 0\n", "direct = \"never\"\n"].map(str::to_owned);
+    for topic in crate::TOPICS {
+        shares += &format!("[[share]]\ntopic = \"{}\"\nto = [\"{desk}\"]\n", topic.name);
+        uses += &format!("[[use]]\nfrom = \"{robot}\"\ntopic = \"{}\"\n", topic.name);
+    }
+    (shares, uses)
+}
+
 #[test]
 fn names_are_found_in_a_store_and_outlive_it() {
     if !can_run() {
@@ -44,12 +59,7 @@ fn names_are_found_in_a_store_and_outlive_it() {
     };
     let first = router("cloud", &[], "quic://0.0.0.0:7447");
     let second = router("cloud-2", &["quic://10.10.0.1:7447"], "quic://0.0.0.0:7501");
-    let [mut shares, mut uses] =
-        ["direct = \"never\"\n[ros]\ndomain_id = 0\n", "direct = \"never\"\n"].map(str::to_owned);
-    for topic in crate::TOPICS {
-        shares += &format!("[[share]]\ntopic = \"{}\"\nto = [\"desk\"]\n", topic.name);
-        uses += &format!("[[use]]\nfrom = \"robot\"\ntopic = \"{}\"\n", topic.name);
-    }
+    let (shares, uses) = rules("robot", "desk");
     let pair = Pair::between(&lab, ["robot", "desk"], [&shares, &uses], [&lab.url("quic"), SECOND]);
     pair.wait_for("never begins", |_| 1);
     let found = store_of(&second);
@@ -73,5 +83,75 @@ fn names_are_found_in_a_store_and_outlive_it() {
     pair.wait_for("does not stay", |flow| flow.said() + 1);
     for flow in &pair.flows {
         flow.end();
+    }
+}
+
+#[test]
+fn router_with_a_wrong_password_and_routers_without_the_store_find_names_by_asking() {
+    if !can_run() {
+        return;
+    }
+    assert!(is_redis_installed(), "no redis-server: scripts/install-deps.sh test");
+    let _turn = shared_turn();
+    let lab = Lab::new(cable(), Nat::Public);
+    let redis = Redis::single(lab.cloud.clone(), &lab.path("redis"), "127.0.0.1", RedisOptions::default());
+    let user = ["ACL", "SETUSER", "router", "on", ">right", "~lab:*", "+@all"];
+    assert_eq!(redis.cli(0, &user).trim(), "OK");
+    for password in ["right", "wrong"] {
+        let file = lab.path(password);
+        fs::write(&file, password).unwrap();
+        fs::set_permissions(&file, fs::Permissions::from_mode(0o600)).unwrap();
+    }
+    let store = |password: &str| {
+        format!(
+            "mapping = \"store\"\nstore = [\"{}\"]\nstore_prefix = \"lab\"\nstore_user = \"router\"\n\
+             store_password_file = \"{password}\"\n",
+            redis.urls()[0]
+        )
+    };
+    let router = |name: &str, port: u16, mapping: &str| {
+        let others: &[&str] = if port == 7447 { &[] } else { &["quic://10.10.0.1:7447"] };
+        let rest = format!("[router]\nlisten = [\"quic://0.0.0.0:{port}\"]\n{mapping}");
+        let file = lab.write_config(name, others, &rest);
+        (Node::start(&lab.cloud, &file, lab.enroll(name, true), None), file)
+    };
+    let (right, right_file) = router("cloud", 7447, &store("right"));
+    let (wrong, wrong_file) = router("cloud-2", 7501, &store("wrong"));
+    let _query = router("cloud-3", 7502, "mapping = \"query\"\n");
+    let _flood = router("cloud-4", 7503, "mapping = \"flood\"\n");
+    eventually("the router with the right password has the store", || store_of(&right)["answers"] == true);
+
+    // Robot and desk at different routers, each way between them.
+    let pairs = [(7447, 7501), (7501, 7447), (7447, 7502), (7503, 7447), (7502, 7501)];
+    let pairs = pairs.map(|(near, far)| {
+        let [robot, desk] = [format!("robot-{near}-{far}"), format!("desk-{near}-{far}")];
+        let (shares, uses) = rules(&robot, &desk);
+        let [near, far] = [near, far].map(|port: u16| format!("quic://10.10.0.1:{port}"));
+        Pair::between(&lab, [&robot, &desk], [&shares, &uses], [&near, &far])
+    });
+    for pair in &pairs {
+        pair.wait_for("never begins", |_| 1);
+    }
+    assert!(keys(&redis) > 2, "names, batches and link states");
+
+    eventually("the router says that it has no store", || alerts(&wrong) == ["store_down"]);
+    assert_eq!(store_of(&wrong)["answers"], false);
+    assert_eq!(alerts(&right), [""; 0]);
+    let check = |file: &Path| {
+        let mut command = lab.cloud.command(env!("CARGO_BIN_EXE_sgc"));
+        let output = command.args(["router", "store", "check", "--json", "-c"]).arg(file).output().unwrap();
+        let report: Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{output:?}"));
+        (output.status.code(), report)
+    };
+    let (code, report) = check(&right_file);
+    assert_eq!((code, &report["fits"]), (Some(0), &true.into()), "{report}");
+    let (code, report) = check(&wrong_file);
+    assert_eq!((code, &report["fits"]), (Some(1), &false.into()), "{report}");
+    let finding = &report["findings"][0];
+    assert_eq!(finding["severity"], "error");
+    assert!(finding["fix"].as_str().unwrap().contains("store_password_file"), "{finding}");
+    for pair in &pairs {
+        pair.wait_for("does not stay", |flow| flow.said() + 1);
+        pair.flows.iter().for_each(|flow| flow.end());
     }
 }
