@@ -197,19 +197,19 @@ fn paths_after_random_changes_are_those_of_a_full_computation() {
                     grid.link(n, n + 7);
                 }
             }
-            grid.run("grid", 500);
+            grid.run("grid", 250);
             let mut sparse = Trial::new(seed, 40, costs);
             for n in 1..40 {
                 let to = sparse.below(u32::from(n)) as u16;
                 sparse.link(n, to);
             }
-            sparse.run("tree with more links", 500);
+            sparse.run("tree with more links", 250);
             let mut hub = Trial::new(seed, 40, costs);
             for n in 2..40 {
                 hub.link(n, n % 2);
                 hub.link(n, 1 + n / 2);
             }
-            hub.run("two hubs", 500);
+            hub.run("two hubs", 250);
         }
         let mut ring = Trial { span: 2, ..Trial::new(seed, 200, 3) };
         for n in 0..200 {
