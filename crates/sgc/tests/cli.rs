@@ -964,7 +964,10 @@ fn leaves(command: &clap::Command, name: &str) -> Vec<(String, clap::Command)> {
     let shown = command.get_subcommands().filter(|below| !below.is_hide_set());
     let below: Vec<_> =
         shown.flat_map(|below| leaves(below, format!("{name} {}", below.get_name()).trim())).collect();
-    if below.is_empty() { vec![(name.to_owned(), command.clone())] } else { below }
+    // `sgc router` runs a node, and has a command below it.
+    let does_something = below.is_empty() || command.is_args_conflicts_with_subcommands_set();
+    let itself = does_something.then(|| (name.to_owned(), command.clone()));
+    itself.into_iter().chain(below).collect()
 }
 
 /// Commands without `--json`, and why.
