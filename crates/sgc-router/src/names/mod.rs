@@ -88,8 +88,19 @@ pub(crate) struct Admitted {
     pub(crate) kind: RecordKind,
     /// Names whose routes may have changed.
     pub(crate) changed: Vec<Name>,
-    /// Whether another record with other names spoke for one of them before.
-    pub(crate) moved: bool,
+    /// The records that spoke for them before.
+    pub(crate) before: NamesBefore,
+}
+
+/// The records that spoke for the names of a new one before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum NamesBefore {
+    /// At least one name has none.
+    None,
+    /// One with the same names.
+    Same,
+    /// One with other names.
+    Other,
 }
 
 /// The consequence of a verified announcement.
@@ -293,8 +304,7 @@ impl Names {
             && from.is_router
             && link != LinkId::STORE
             && news.iter().any(|n| self.questions.is_open(n));
-        let moved =
-            news.iter().any(|n| self.records.last_names(n).is_some_and(|names| *names != advert.names));
+        let before = self.records.names_before(&news, &advert.names);
         let record = NewRecord {
             owner: Arc::new(advert.owner),
             seq: advert.body.seq,
@@ -314,7 +324,7 @@ impl Names {
         };
         let id = self.insert(now.instant, record, &news);
         let changed = if kind == RecordKind::Withdrawal { known } else { news };
-        Admission::Admitted(Admitted { id, owner, kind, changed, moved })
+        Admission::Admitted(Admitted { id, owner, kind, changed, before })
     }
 
     /// Returns the names of a verified announcement that it has news of. Without any, whatever has to be said is said.

@@ -1,7 +1,7 @@
 //! A verified advertisement or withdrawal, and those of one owner.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use sgc_trust::VerifiedPeer;
@@ -9,6 +9,7 @@ use sgc_wire::{Name, NodeId, Now, SignedBody, UnixMillis};
 
 use crate::lease::verifies_elsewhere;
 use crate::link_id::LinkId;
+use crate::store::{BatchTag, NameEntry, batch_tag};
 
 /// Approximate memory of a record beside its signed bytes, bytes.
 const RECORD_BYTES: usize = 512;
@@ -53,12 +54,14 @@ pub(crate) struct Record {
     announced: NewRecord,
     /// Names that no newer one speaks for.
     live: usize,
+    /// The tag of its batch in a store.
+    tag: OnceLock<BatchTag>,
 }
 
 impl Record {
     /// Returns a record that speaks for no name yet.
     pub(super) fn new(announced: NewRecord) -> Self {
-        Self { announced, live: 0 }
+        Self { announced, live: 0, tag: OnceLock::new() }
     }
 
     /// Returns the owner, which the branches of its names share.
@@ -89,6 +92,12 @@ impl Record {
     /// Returns its names, also those that a newer one speaks for.
     pub(crate) fn names(&self) -> &[Name] {
         &self.announced.names
+    }
+
+    /// Returns the value of its names in a store.
+    pub(crate) fn store_entry(&self) -> NameEntry {
+        let tag = *self.tag.get_or_init(|| batch_tag(self.names()));
+        NameEntry { owner: self.owner_id(), tag }
     }
 
     /// Returns it as its owner signed it.

@@ -6,6 +6,7 @@ use std::time::Instant;
 use sgc_trust::{CLOCK_SKEW_MAX, CertId};
 use sgc_wire::{Control, Name, NodeId, Now, SignedBody};
 
+use super::NamesBefore;
 use super::record::{NewRecord, OwnerRecords, Record, RecordEnd, RecordId, RecordKind};
 use crate::limits::Limits;
 use crate::link_id::LinkId;
@@ -108,9 +109,20 @@ impl Records {
         self.records.get(self.words.get(name)?)
     }
 
-    /// Returns the names of the newest record of a name.
-    pub(super) fn last_names(&self, name: &Name) -> Option<&[Name]> {
-        self.last(name).map(Record::names)
+    /// Returns the records that spoke for `news` before, beside all names of the record that brings them.
+    pub(super) fn names_before(&self, news: &[Name], names: &[Name]) -> NamesBefore {
+        let mut before = NamesBefore::Same;
+        let mut same: Option<&Record> = None;
+        for name in news {
+            match self.last(name) {
+                None => before = NamesBefore::None,
+                // Names of a renewal have one record, whose names are compared once.
+                Some(record) if same.is_some_and(|same| std::ptr::eq(same, record)) => {}
+                Some(record) if record.names() == names => same = Some(record),
+                Some(_) => return NamesBefore::Other,
+            }
+        }
+        before
     }
 
     /// Returns the newest known sequence number of a name, withdrawn or not.

@@ -54,8 +54,8 @@ impl Router {
 
     /// Passes on a record that was just put into force, and lets everything else follow it.
     fn pass_on_record(&mut self, link: LinkId, cost: u32, admitted: Admitted) {
-        let Admitted { id, owner, kind, mut changed, moved } = admitted;
-        self.store_record(&owner, id, moved);
+        let Admitted { id, owner, kind, mut changed, before } = admitted;
+        self.store_record(&owner, id, before);
         match kind {
             RecordKind::Advert => {
                 // A node that only listens may learn of known names from another neighbour.

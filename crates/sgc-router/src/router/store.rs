@@ -7,11 +7,10 @@ use sgc_wire::{Encode, Name, NodeId, Now};
 use super::Router;
 use crate::link_id::LinkId;
 use crate::links::Peer;
-use crate::names::{RecordId, RecordKind};
+use crate::names::{NamesBefore, RecordId, RecordKind};
 use crate::output::Output;
 use crate::store::{
-    Finding, LookUpEnd, NameEntry, StoreEvent, StoreKey, StoreStats, Work, batch_tag, decode_signed,
-    encode_signed,
+    Finding, LookUpEnd, StoreEvent, StoreKey, StoreStats, Work, decode_signed, encode_signed,
 };
 
 /// Least lifetime of a value that is worth a write.
@@ -133,14 +132,18 @@ impl Router {
 
     // ---- Work.
 
-    /// Has a record written that a node attached here brought. `moved` names were in another batch.
-    pub(super) fn store_record(&mut self, owner: &NodeId, id: RecordId, moved: bool) {
+    /// Has a record written that a node attached here brought.
+    pub(super) fn store_record(&mut self, owner: &NodeId, id: RecordId, before: NamesBefore) {
         if let Some(store) = &mut self.store
             && self.links.is_attached(owner)
         {
-            store.add_work(Work::Record(id));
-            if moved {
-                store.add_work(Work::NamesOf(id));
+            match before {
+                NamesBefore::None => store.add_work(Work::NewRecord(id)),
+                NamesBefore::Same => store.add_work(Work::Record(id)),
+                NamesBefore::Other => {
+                    store.add_work(Work::Record(id));
+                    store.add_work(Work::NamesOf(id));
+                }
             }
         }
     }
@@ -171,14 +174,14 @@ impl Router {
                     store.write(StoreKey::Node(node), value, Some(lifetime), work, None);
                 }
             }
-            Work::Record(id) | Work::NamesOf(id) => {
+            Work::NewRecord(id) | Work::Record(id) | Work::NamesOf(id) => {
                 let Some(record) = self.names.record(id) else { return };
                 let lifetime = record.expires().saturating_duration_since(now);
-                let entry = NameEntry { owner: record.owner_id(), tag: batch_tag(record.names()) };
+                let entry = record.store_entry();
                 if !self.links.is_attached(&entry.owner) || lifetime < LIFETIME_MIN {
                     return;
                 }
-                if matches!(work, Work::Record(_)) {
+                if !matches!(work, Work::NamesOf(_)) {
                     let value = encode_signed(record.signed());
                     return store.write(entry.batch(), value, Some(lifetime), work, Some(Work::NamesOf(id)));
                 }
@@ -192,8 +195,7 @@ impl Router {
             Work::Check(name) => {
                 let Some(record) = self.names.record_of(&name) else { return };
                 if self.links.is_attached(&record.owner_id()) {
-                    let tag = batch_tag(record.names());
-                    store.check(now, name, NameEntry { owner: record.owner_id(), tag });
+                    store.check(now, name, record.store_entry());
                 }
             }
         }

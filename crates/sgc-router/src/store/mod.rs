@@ -36,6 +36,9 @@ const RETRY_MIN: Duration = Duration::from_secs(1);
 const RETRY_MAX: Duration = Duration::from_secs(32);
 /// Time between two steps of the work that a store needs when it answers again.
 const PACE: Duration = Duration::from_micros(500);
+/// Batches whose first write may have reached the store although it failed. Names of further ones are written when a
+/// question shows that the store lacks them.
+const UNSURE_MAX: usize = 16_384;
 
 /// The state of a router's store, for status.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -71,7 +74,9 @@ pub(crate) enum Work {
     Node(NodeId),
     /// Look a name up again.
     LookUp(Name),
-    /// Write a record, and its names if the store does not have the record's batch.
+    /// Write a record of names that had none here, as [`Work::Record`] does.
+    NewRecord(RecordId),
+    /// Write a record, and its names if the store did not have the record's batch.
     Record(RecordId),
     /// Write the names of a record.
     NamesOf(RecordId),
@@ -194,6 +199,8 @@ pub(crate) struct Store {
     later: BTreeSet<(Instant, Work)>,
     /// Work to be repeated because a write failed.
     repetitions: BTreeMap<Work, Instant>,
+    /// Batches that the store may have got from a first write that failed, without their names.
+    unsure: BTreeSet<StoreKey>,
     /// Repetitions since the last write that succeeded.
     failures_in_row: u32,
     findings: VecDeque<Finding>,
@@ -213,6 +220,7 @@ impl Store {
             work: BTreeSet::new(),
             later: BTreeSet::new(),
             repetitions: BTreeMap::new(),
+            unsure: BTreeSet::new(),
             failures_in_row: 0,
             findings: VecDeque::new(),
             stats: StoreStats { down_since: Some(now), ..StoreStats::default() },
@@ -319,9 +327,15 @@ impl Store {
                 match result {
                     Ok(StoreReply::Written { existed }) => {
                         self.failures_in_row = 0;
-                        self.work.extend(then.filter(|_| !existed));
+                        let is_new = self.unsure.remove(&key) || !existed;
+                        self.work.extend(then.filter(|_| is_new));
                     }
-                    _ => self.repeat(now, work),
+                    _ => {
+                        if matches!(work, Work::NewRecord(_)) && self.unsure.len() < UNSURE_MAX {
+                            self.unsure.insert(key);
+                        }
+                        self.repeat(now, work);
+                    }
                 }
             }
             Purpose::RemoveOrphan { name, entry } => {

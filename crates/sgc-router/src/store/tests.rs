@@ -144,6 +144,27 @@ fn names_of_a_batch_are_written_if_it_had_no_value() {
 }
 
 #[test]
+fn names_follow_a_first_write_that_may_have_arrived() {
+    let mut now = Clock::default().now().instant;
+    for (work, next) in [(Work::NewRecord(3), Some(Work::NamesOf(3))), (Work::Record(3), None)] {
+        let mut store = up(now);
+        let write = |store: &mut Store, work, result| {
+            store.write(entry(7).batch(), Bytes::new(), None, work, Some(Work::NamesOf(3)));
+            let op = operations(store, now).remove(0);
+            answer(store, now, &op, result);
+        };
+        write(&mut store, work, Err(StoreFailure::Unreachable));
+        assert_eq!(store.take_work(), None);
+        // The first write arrived, or so it seems. A renewal can be the next.
+        write(&mut store, Work::Record(3), Ok(StoreReply::Written { existed: true }));
+        assert_eq!(store.take_work(), next);
+        write(&mut store, work, Ok(StoreReply::Written { existed: true }));
+        assert_eq!(store.take_work(), None);
+        now += RETRY_MAX;
+    }
+}
+
+#[test]
 fn work_whose_writes_fail_is_repeated_once_and_later_each_time() {
     let mut now = Clock::default().now().instant;
     let mut store = up(now);
