@@ -48,6 +48,7 @@ fn main() -> io::Result<()> {
     write("sink", sink())?;
     write("checks", checks())?;
     write("grants", grants())?;
+    write("store", store())?;
     write("gateway", gateway())
 }
 
@@ -74,6 +75,28 @@ fn checks() -> Vec<Vec<u8>> {
     let mut altered = datagrams.first().cloned().unwrap_or_default();
     altered.iter_mut().skip(20).step_by(7).for_each(|byte| *byte ^= 1);
     vec![all(|_| 2), all(|n| n as u8 + 3), framed(2, &altered)]
+}
+
+/// Returns replies of all types, and servers that answer as a cluster and as a single server.
+fn store() -> Vec<Vec<u8>> {
+    const READY: [u8; 2] = [4, 0];
+    const WAIT: [u8; 2] = [6, 100];
+    let send = |bytes: &[u8]| [&[9, bytes.len() as u8], bytes].concat();
+    let replies = b"\0+OK\r\n:-7\r\n$3\r\nabc\r\n_\r\n#t\r\n-MOVED 7 a:1\r\n*2\r\n%1\r\n+a\r\n:1\r\n$-1\r\n>2\r\n+invalidate\r\n_\r\n";
+    let info = send(b"+cluster_state:ok\r\n");
+    let slots = send(b"*1\r\n*3\r\n:0\r\n:16383\r\n*2\r\n+a\r\n:1\r\n");
+    let single = send(b"-ERR This instance has cluster support disabled\r\n");
+    let with = |slots: &[u8], answer: &[u8]| {
+        let parts: [&[u8]; 8] = [&[1], &READY, &info, slots, &[0, 7], &send(answer), &WAIT, &[2, 8]];
+        parts.concat()
+    };
+    vec![
+        replies.to_vec(),
+        with(&slots, b"$5\r\nvalue\r\n"),
+        with(&slots, b"-ASK 5 b:2\r\n"),
+        with(&slots, b">2\r\n+invalidate\r\n*1\r\n+sgc:n:\r\n"),
+        with(&single, b"-READONLY\r\n"),
+    ]
 }
 
 /// Returns conversations by the rosbridge protocol and by Foxglove's.

@@ -29,6 +29,7 @@ pub mod grants;
 pub mod mux;
 pub mod packet;
 pub mod sink;
+pub mod store;
 pub mod values;
 
 /// Body of a fuzz target.
@@ -50,6 +51,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("mux", mux::run),
     ("packet", packet::run),
     ("sink", sink::run),
+    ("store", store::run),
     ("values", values::run),
 ];
 

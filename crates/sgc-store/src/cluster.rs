@@ -328,6 +328,16 @@ impl Cluster {
         servers.chain(topology).chain(look).chain(overdue).chain(up).min().unwrap_or(now + PROBE_AFTER)
     }
 
+    /// Panics if there are more operations, servers or links than the bounds allow.
+    #[cfg(any(test, feature = "fuzzing"))]
+    pub(crate) fn assert_bounded(&self) {
+        assert!(self.ops.len() <= OPS_MAX, "{} operations", self.ops.len());
+        let servers_max = self.seeds.len() + GUESTS_MAX + 2 * crate::topology::NODES_MAX;
+        assert!(self.servers.len() <= servers_max, "{} servers", self.servers.len());
+        assert!(self.links.len() <= self.servers.len(), "{} links", self.links.len());
+        assert!(self.waiting <= self.ops.len(), "{} waiting operations", self.waiting);
+    }
+
     // ---- Operations.
 
     fn reply(&mut self, id: sgc_router::StoreOpId, result: Result<StoreReply, StoreFailure>) {
@@ -783,17 +793,10 @@ fn is_state_ok(reply: &Frame) -> bool {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
-    use sgc_router::{StoreKey, StoreOpId, WriteIf};
     use sgc_testkit::{Clock, Dice};
-    use sgc_wire::Name;
 
     use super::*;
-    use crate::config::StorePrefix;
-
-    fn config() -> StoreConfig {
-        let servers = ["valkey://a:1", "valkey://b:2"].iter().map(|url| url.parse().unwrap()).collect();
-        StoreConfig::new(servers, StorePrefix::default(), None, None).unwrap()
-    }
+    use crate::fuzzing::Watched;
 
     /// Returns a frame as no honest server sends it, or as one may.
     fn frame(dice: &mut Dice, depth: u32) -> Frame {
@@ -826,56 +829,20 @@ mod tests {
     fn operations_end_once_and_in_time_whatever_servers_send() {
         for seed in 0..200 {
             let mut dice = Dice::new(seed);
-            let mut now = Clock::default().now().instant;
-            let mut cluster = Cluster::new(now, &config(), seed);
-            let (mut links, mut under_way, mut next) = (Vec::new(), BTreeMap::new(), 0);
+            let mut watched = Watched::new(Clock::default().now().instant, seed);
             for _ in 0..500 {
-                while let Some(output) = cluster.poll_output() {
-                    match output {
-                        Output::Open { link, .. } => links.push(link),
-                        Output::Close { link } => links.retain(|open| *open != link),
-                        Output::Event(StoreEvent::Reply { id, .. }) => {
-                            let begun: Option<Instant> = under_way.remove(&id);
-                            let took = now - begun.expect("one result of each operation");
-                            assert!(took <= OP_TIMEOUT + LOOK_EVERY, "seed {seed}: {took:?}");
-                        }
-                        Output::Event(_) | Output::Send { .. } | Output::Warn(_) | Output::Inform(_) => {}
-                    }
-                }
-                assert!(cluster.servers.len() <= 2 + GUESTS_MAX + 2 * 128, "seed {seed}");
                 match dice.below(10) {
-                    0..3 if cluster.has_room() => {
-                        let key = StoreKey::Name(Name([dice.below(256) as u8; 32]));
-                        let value = Bytes::from_static(b"value");
-                        let action = match dice.below(3) {
-                            0 => StoreAction::Read,
-                            1 => StoreAction::Remove { value },
-                            _ => StoreAction::Write { value, lifetime: None, condition: WriteIf::Always },
-                        };
-                        let id = StoreOpId(next);
-                        next += 1;
-                        under_way.insert(id, now);
-                        cluster.handle_op(now, StoreOp { id, key, action });
-                    }
+                    0..3 => watched.begin(dice.below(3) as u8, dice.below(256) as u8),
                     3..8 => {
-                        let Some(link) = dice.pick(&links) else { continue };
+                        let which = dice.below(256);
                         let event = match dice.below(12) {
                             0..4 => LinkEvent::Ready,
                             4 => LinkEvent::Closed("gone".to_owned()),
                             _ => LinkEvent::Frame(frame(&mut dice, 0)),
                         };
-                        if matches!(event, LinkEvent::Closed(_)) {
-                            links.retain(|open| *open != link);
-                        }
-                        cluster.handle_link(now, link, event);
+                        watched.link(which, event);
                     }
-                    _ => {
-                        let due = cluster.next_timeout(now).max(now);
-                        now = due.min(now + Duration::from_millis(dice.below(300) as u64));
-                        if now >= due {
-                            cluster.handle_timeout(now);
-                        }
-                    }
+                    _ => watched.wait(Duration::from_millis(dice.below(300) as u64)),
                 }
             }
         }

@@ -12,6 +12,8 @@ mod cluster;
 mod command;
 mod config;
 mod driver;
+#[cfg(any(test, feature = "fuzzing"))]
+mod fuzzing;
 mod key;
 mod link;
 mod resp;
@@ -24,3 +26,5 @@ pub use config::{
 
 pub use check::{Severity, StoreFinding, StoreReport, check};
 pub use driver::run;
+#[cfg(feature = "fuzzing")]
+pub use fuzzing::{fuzz_replies, fuzz_servers};

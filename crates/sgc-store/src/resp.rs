@@ -297,6 +297,7 @@ pub(crate) fn encode(command: &[&[u8]], to: &mut Vec<u8>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fuzzing::decode_in_pieces;
 
     const LIMITS: Limits = Limits { string_bytes_max: 16, frame_bytes_max: 1024 };
 
@@ -304,24 +305,8 @@ mod tests {
         Frame::Text(Bytes::from_static(text.as_bytes()))
     }
 
-    /// Decodes in pieces of each length, which must make no difference.
     fn decode(bytes: &[u8]) -> Result<Vec<Frame>, RespError> {
-        let of_pieces = |piece: usize| {
-            let mut decoder = Decoder::new(LIMITS);
-            let mut frames = Vec::new();
-            for piece in bytes.chunks(piece) {
-                decoder.buffer().extend_from_slice(piece);
-                while let Some(frame) = decoder.next_frame()? {
-                    frames.push(frame);
-                }
-            }
-            Ok(frames)
-        };
-        let whole = of_pieces(bytes.len().max(1));
-        for piece in [1, 2, 3, 7] {
-            assert_eq!(of_pieces(piece), whole, "in pieces of {piece}");
-        }
-        whole
+        decode_in_pieces(bytes, LIMITS)
     }
 
     #[test]
