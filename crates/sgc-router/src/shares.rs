@@ -57,6 +57,11 @@ impl<K: Ord + Copy, V> Shares<K, V> {
         self.entries.is_empty()
     }
 
+    /// Iterates over the keys of a range that have an entry.
+    pub(crate) fn keys(&self, range: RangeInclusive<K>) -> impl Iterator<Item = &K> {
+        self.entries.range(range).map(|(key, _)| key)
+    }
+
     /// Returns how many entries a node holds.
     pub(crate) fn held_by(&self, node: &NodeId) -> usize {
         self.of_node.get(node).map_or(0, BTreeSet::len)

@@ -43,6 +43,11 @@ impl Interests {
         self.watchers.keys()
     }
 
+    /// Returns the number of names that some link wants to know of.
+    pub(super) fn watched_len(&self) -> usize {
+        self.watchers.len()
+    }
+
     /// Returns `true` if some link wants to know of the name.
     pub(super) fn is_watched(&self, name: &Name) -> bool {
         self.watchers.contains_key(name)

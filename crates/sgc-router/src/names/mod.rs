@@ -148,6 +148,16 @@ impl Names {
         self.records.names_of(owner)
     }
 
+    /// Returns the number of names that the advertisements of these owners speak for.
+    pub(crate) fn count_of(&self, owners: &BTreeSet<NodeId>) -> usize {
+        self.records.count_of(owners)
+    }
+
+    /// Returns the number of names that some link wants to know of.
+    pub(crate) fn watched_len(&self) -> usize {
+        self.interests.watched_len()
+    }
+
     /// Iterates over the names that some link wants to know of.
     pub(crate) fn watched(&self) -> impl Iterator<Item = &Name> {
         self.interests.watched()

@@ -1,6 +1,7 @@
 //! [`Questions`]: the names that are asked for here, and the questions of other routers.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
 use sgc_wire::{Name, NodeId};
@@ -40,6 +41,11 @@ pub(super) enum Asked {
     TooMany,
 }
 
+/// Returns the keys of everything that was asked over a link.
+fn all_of(link: LinkId) -> RangeInclusive<(LinkId, Name)> {
+    (link, Name([0; 32]))..=(link, Name([0xff; 32]))
+}
+
 /// All questions.
 #[derive(Debug)]
 pub(super) struct Questions {
@@ -77,7 +83,7 @@ impl Questions {
 
     /// Forgets the questions of a link.
     pub(super) fn link_down(&mut self, link: LinkId) {
-        self.asks.remove_range((link, Name([0; 32]))..=(link, Name([0xff; 32])));
+        self.asks.remove_range(all_of(link));
         self.follows.remove(&link);
     }
 
@@ -173,9 +179,14 @@ impl Questions {
         self.asks.contains(&(link, *name))
     }
 
-    /// Returns `true` if the node asked for a name that was unknown.
-    pub(super) fn asks_any(&self, node: &NodeId) -> bool {
-        self.asks.held_by(node) > 0
+    /// Returns the number of names that the node asked for and that were unknown.
+    pub(super) fn asked_by(&self, node: &NodeId) -> usize {
+        self.asks.held_by(node)
+    }
+
+    /// Iterates over the names that the router behind a link asked for and that were unknown.
+    pub(super) fn asked_over(&self, link: LinkId) -> impl Iterator<Item = &Name> {
+        self.asks.keys(all_of(link)).map(|(_, name)| name)
     }
 
     /// Notes that a router is told these names of an owner, and of changes from now on. Returns `true` if it was not

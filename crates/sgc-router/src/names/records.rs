@@ -161,6 +161,11 @@ impl Records {
         named.flat_map(move |(id, r)| r.names().iter().filter(move |n| self.words.get(*n) == Some(&id)))
     }
 
+    /// Returns the number of names that the advertisements of these owners speak for.
+    pub(super) fn count_of(&self, owners: &BTreeSet<NodeId>) -> usize {
+        owners.iter().filter_map(|owner| self.owners.get(owner)).map(OwnerRecords::names).sum()
+    }
+
     /// Returns the names that a record still speaks for.
     pub(super) fn live_names(&self, id: RecordId) -> Vec<Name> {
         let Some(record) = self.records.get(&id) else { return Vec::new() };

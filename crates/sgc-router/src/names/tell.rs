@@ -1,6 +1,6 @@
 //! Telling names: routers, all or those that asked, and links with an interest.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use sgc_wire::{Control, NAMES_PER_FRAME_MAX, Name, NodeId, Now};
 
@@ -75,15 +75,30 @@ impl Names {
     }
 
     /// Answers open questions for the names of these owners.
-    pub(crate) fn answer_asks(&mut self, cx: &mut Context<'_>, owners: &[NodeId]) {
-        let links = cx.network.links.iter();
-        let waiting: Vec<_> =
-            links.filter(|(_, state)| self.questions.asks_any(state.node())).map(|(link, _)| link).collect();
+    pub(crate) fn answer_asks(&mut self, cx: &mut Context<'_>, owners: &BTreeSet<NodeId>) {
+        let links =
+            cx.network.links.iter().map(|(link, state)| (link, self.questions.asked_by(state.node())));
+        let waiting: Vec<_> = links.filter(|(_, asked)| *asked > 0).collect();
+        let asked: usize = waiting.iter().map(|(_, asked)| asked).sum();
         let mut open = Vec::new();
-        for owner in owners {
-            for name in self.records.names_of(owner) {
-                let by = waiting.iter().filter(|link| self.questions.asks(**link, name));
-                open.extend(by.map(|link| (*link, *owner, *name)));
+        if asked < self.records.count_of(owners) {
+            for (link, _) in waiting {
+                let named = self
+                    .questions
+                    .asked_over(link)
+                    .filter_map(|name| Some((self.owner(name)?.node_id, *name)));
+                open.extend(
+                    named
+                        .filter(|(owner, _)| owners.contains(owner))
+                        .map(|(owner, name)| (link, owner, name)),
+                );
+            }
+        } else {
+            for owner in owners {
+                for name in self.records.names_of(owner) {
+                    let by = waiting.iter().filter(|(link, _)| self.questions.asks(*link, name));
+                    open.extend(by.map(|(link, _)| (*link, *owner, *name)));
+                }
             }
         }
         for (link, owner, name) in open {

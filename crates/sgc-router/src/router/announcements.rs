@@ -237,13 +237,21 @@ impl Router {
             let names = self.names.watched().chain(self.trees.names()).copied().collect();
             return self.check_next_hops(names);
         }
-        let owners: Vec<_> = self.topology.search(self.now.instant).into_iter().collect();
-        // Names without an advertisement have no route before or after.
-        let counts = |name: &&Name| self.names.is_watched(name) || self.trees.contains(name);
-        let names = owners.iter().flat_map(|owner| self.names.names_of(owner).filter(counts)).copied();
-        let names = names.collect();
-        self.check_next_hops(names);
+        let owners = self.topology.search(self.now.instant);
+        self.check_next_hops(self.used_names_of(&owners));
         self.names_part(|names, cx| names.answer_asks(cx, &owners));
+    }
+
+    /// Returns the names of these owners that somebody uses. Names without an advertisement have no route before or after.
+    /// Owners can have many names and a router few that are used, or the other way round.
+    fn used_names_of(&self, owners: &BTreeSet<NodeId>) -> BTreeSet<Name> {
+        if self.names.watched_len() + self.trees.names_len() < self.names.count_of(owners) {
+            let is_theirs =
+                |name: &&Name| self.names.owner(name).is_some_and(|owner| owners.contains(&owner.node_id));
+            return self.names.watched().chain(self.trees.names()).filter(is_theirs).copied().collect();
+        }
+        let is_used = |name: &&Name| self.names.is_watched(name) || self.trees.contains(name);
+        owners.iter().flat_map(|owner| self.names.names_of(owner).filter(is_used)).copied().collect()
     }
 
     fn check_next_hops(&mut self, names: BTreeSet<Name>) {

@@ -85,6 +85,11 @@ impl Trees {
         self.trees.keys()
     }
 
+    /// Returns the number of names with branches.
+    pub(crate) fn names_len(&self) -> usize {
+        self.trees.len()
+    }
+
     /// Returns the number of branches.
     pub(crate) fn len(&self) -> usize {
         self.trees.values().map(Tree::len).sum()
