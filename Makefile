@@ -16,7 +16,7 @@ CLIENTS := $(addprefix --test ,foxglove grpc otlp rosbridge)
 COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \
 	SGC_COMMIT_DATE=$${SGC_COMMIT_DATE-$$(git log -1 --format=%cs 2>/dev/null)}
 
-.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-direct bench-instructions bench-store scale bench-link-state clean-tools deps-bench bench-peers
+.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-direct bench-instructions bench-store bench-look-up scale bench-link-state clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--duration 10s --json")'
@@ -49,6 +49,7 @@ help:
 	@echo '                 bench-gateway (gRPC and the rosbridge protocol)'
 	@echo '                 bench-direct (direct paths between two NATs, beside WireGuard and iroh; root, half an hour)'
 	@echo '                 bench-store (names in a cluster of redis-server; root, a minute; ARGS="--names 10000000")'
+	@echo '                 bench-look-up (the first look-up of a name by flood, query and store; root)'
 	@echo '                 bench-link-state (one router among up to 10 000)'
 	@echo '                 bench-instructions (whether hot functions take more instructions than before; ARGS=--accept)'
 	@echo '                 bench-peers (build the systems that bench runs beside SGC)'
@@ -285,6 +286,12 @@ scale:
 # Fills a cluster of redis-server with names, looks them up, kills servers, and prints the table of benchmarks/store.md; root.
 bench-store:
 	$(CARGO) run --release --locked -p sgc-store --example names -- $(ARGS)
+
+# Looks names up at routers' processes by the mappings flood, query and store, in one run; root.
+bench-look-up: build
+	$(CARGO) run --release --locked --no-default-features --manifest-path bench/Cargo.toml -- first-look-up \
+		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
+
 # Measures one router among 100, 1000 and 10 000: searches for paths, and everything else that its link states cost.
 bench-link-state:
 	$(CARGO) run --release --locked -p sgc-testkit --example link_state -- $(ARGS)

@@ -10,7 +10,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use anyhow::Result;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_trust::{EnrollRequest, Fleet, Identity};
-use sgc_wire::{Now, UnixMillis};
+use sgc_wire::{NodeId, Now, UnixMillis};
 
 /// A fleet and what it needs to enrol.
 pub(crate) struct BenchFleet(Fleet);
@@ -28,16 +28,18 @@ impl BenchFleet {
     }
 
     /// Writes the identity of a router where [`crate::process::SgcRouter`] looks for it.
-    pub(crate) fn write_router(&self, dir: &Path) -> Result<()> {
+    pub(crate) fn write_router(&self, dir: &Path) -> Result<NodeId> {
         self.write(dir, "router", true)
     }
 
-    /// Writes `NODE.identity`, as `sgc fleet enroll` does.
-    pub(crate) fn write(&self, dir: &Path, node: &str, router: bool) -> Result<()> {
+    /// Writes `NODE.identity`, as `sgc fleet enroll` does. Returns the node's id.
+    pub(crate) fn write(&self, dir: &Path, node: &str, router: bool) -> Result<NodeId> {
         let mut options = fs::OpenOptions::new();
         let path = dir.join(format!("{node}.identity"));
         let mut file = options.write(true).create_new(true).mode(0o600).open(path)?;
-        Ok(file.write_all(self.issue(node, router)?.to_text().as_bytes())?)
+        let identity = self.issue(node, router)?;
+        file.write_all(identity.to_text().as_bytes())?;
+        Ok(identity.node_id())
     }
 }
 

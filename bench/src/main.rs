@@ -1,12 +1,13 @@
 //! Benchmarks on real sockets; `README.md` says what each part measures and how to read it.
 //!
-//! This file knows the command line. The parts are [`compare`], [`direct`], [`forward`], [`gateway`], [`rib`],
-//! [`first_message`], [`teleop`] and [`transports`]; [`fleet`], [`node`], [`process`], [`report`] and [`uplink`] are
+//! This file knows the command line. The parts are [`compare`], [`direct`], [`first_look_up`], [`first_message`],
+//! [`forward`], [`gateway`], [`rib`], [`teleop`] and [`transports`]; [`fleet`], [`node`], [`process`], [`report`] and [`uplink`] are
 //! shared.
 #![forbid(unsafe_code)]
 
 mod compare;
 mod direct;
+mod first_look_up;
 mod first_message;
 mod fleet;
 mod forward;
@@ -41,6 +42,8 @@ enum Command {
     Rib(RunArgs),
     /// From a publisher's link to the first message at a subscriber
     FirstMessage(RunArgs),
+    /// The first look-up of a name by the mappings flood, query and store; needs root and redis-server
+    FirstLookUp(RunArgs),
     /// Commands, state and a camera over a thin uplink, by every transport; needs root
     Teleop(RunArgs),
     /// Links by every transport beside TCP and TLS; needs root for the part with losses
@@ -125,6 +128,7 @@ fn main() -> Result<()> {
         Command::Forward(args) => part(&args, "forward", forward::run),
         Command::Rib(args) => part(&args, "rib", rib::run),
         Command::FirstMessage(args) => part(&args, "first-message", first_message::run),
+        Command::FirstLookUp(args) => part(&args, "first-look-up", first_look_up::run),
         Command::Teleop(args) => part(&args, "teleop", teleop::run),
         Command::Transports(args) => part(&args, "transports", transports::run),
         Command::RouterMemory(args) => part(&args, "router-memory", transports::router::run),

@@ -96,10 +96,15 @@ impl SgcRouter {
 
     /// Starts a router with a listener of this scheme.
     pub(crate) fn start_on(scheme: &str, sgc: &Path, dir: &Path) -> Result<Self> {
+        Self::start_as(scheme, sgc, dir, "", "")
+    }
+
+    /// Starts one with further lines in `[node]` and in `[router]`.
+    pub(crate) fn start_as(scheme: &str, sgc: &Path, dir: &Path, node: &str, router: &str) -> Result<Self> {
         let (config, socket) = (dir.join("router.toml"), dir.join("router.sock"));
         let text = format!(
             "identity = \"router.identity\"\n[node]\nstate = \"router.state\"\n\
-             [router]\nlisten = [\"{scheme}://127.0.0.1:0\"]\n[admin]\nsocket = {:?}\n",
+             {node}[router]\n{router}listen = [\"{scheme}://127.0.0.1:0\"]\n[admin]\nsocket = {:?}\n",
             socket.display().to_string()
         );
         fs::write(&config, text)?;
@@ -112,15 +117,19 @@ impl SgcRouter {
         Ok(Self { process, url, socket })
     }
 
+    /// Returns its status document.
+    pub(crate) fn status(&self) -> Result<serde_json::Value> {
+        status(&self.socket)
+    }
+
     /// Returns the number of names for which it has a route.
     pub(crate) fn routed_names(&self) -> Result<u64> {
-        let status = status(&self.socket)?;
-        status["router"]["routed_names"].as_u64().context("a status without `routed_names`")
+        self.status()?["router"]["routed_names"].as_u64().context("a status without `routed_names`")
     }
 
     /// Returns the number of its links.
     pub(crate) fn links(&self) -> Result<usize> {
-        Ok(status(&self.socket)?["links"].as_array().context("a status without `links`")?.len())
+        Ok(self.status()?["links"].as_array().context("a status without `links`")?.len())
     }
 
     /// Waits until the router has a route for so many names, while their number grows. Counting them takes the router's

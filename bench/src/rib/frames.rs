@@ -11,7 +11,7 @@ use sgc_wire::{
 };
 
 /// Names in a full advertisement.
-pub(super) const BATCH: usize = ADVERT_NAMES_MAX;
+pub(crate) const BATCH: usize = ADVERT_NAMES_MAX;
 /// Names of one owner: a little less than a router takes from a proxy, so that there is room for those that are added
 /// one at a time.
 pub(super) const NAMES_PER_OWNER: usize = 60 * BATCH;
@@ -22,27 +22,27 @@ const REPLY_KEY_BYTES: usize = 32;
 const SEALED_BYTES: usize = 59;
 
 /// A node that owns names or subscribes to them, and its link at the router (or at this side of a real one).
-pub(super) struct Member<L> {
-    pub(super) identity: Arc<Identity>,
-    pub(super) link: L,
+pub(crate) struct Member<L> {
+    pub(crate) identity: Arc<Identity>,
+    pub(crate) link: L,
     chain: Vec<Bytes>,
     seq: u64,
 }
 
 /// An advertisement.
-pub(super) struct Advert {
-    pub(super) names: Vec<Name>,
-    pub(super) bytes: Bytes,
+pub(crate) struct Advert {
+    pub(crate) names: Vec<Name>,
+    pub(crate) bytes: Bytes,
 }
 
 impl<L> Member<L> {
-    pub(super) fn new(identity: Arc<Identity>, link: L) -> Self {
+    pub(crate) fn new(identity: Arc<Identity>, link: L) -> Self {
         let chain = identity.chain_bytes();
         Self { identity, link, chain, seq: 0 }
     }
 
     /// An advertisement of so many new names.
-    pub(super) fn advert(&mut self, names: usize, now: UnixMillis, rng: &mut impl RngCore) -> Advert {
+    pub(crate) fn advert(&mut self, names: usize, now: UnixMillis, rng: &mut impl RngCore) -> Advert {
         self.seq += 1;
         let blinds: Vec<_> = (0..names).map(|_| Blind(random(rng))).collect();
         let owner = self.identity.node_id();
@@ -60,7 +60,7 @@ impl<L> Member<L> {
     }
 
     /// A request to subscribe.
-    pub(super) fn join(&self, name: Name, now: UnixMillis, rng: &mut impl RngCore) -> (SinkId, Bytes) {
+    pub(crate) fn join(&self, name: Name, now: UnixMillis, rng: &mut impl RngCore) -> (SinkId, Bytes) {
         let sink = SinkId(random(rng));
         let body = JoinBody {
             name,
@@ -74,7 +74,7 @@ impl<L> Member<L> {
     }
 
     /// The owner's answer to it. Routers cannot look into a grant, so it holds noise.
-    pub(super) fn answer(&self, name: Name, sink: SinkId, rng: &mut impl RngCore) -> Bytes {
+    pub(crate) fn answer(&self, name: Name, sink: SinkId, rng: &mut impl RngCore) -> Bytes {
         let answer = Answer::Grant {
             enc: random::<REPLY_KEY_BYTES>(rng).to_vec().into(),
             sealed: random::<SEALED_BYTES>(rng).to_vec().into(),

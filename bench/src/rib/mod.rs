@@ -8,6 +8,7 @@ mod frames;
 mod machine;
 mod socket;
 
+pub(crate) use frames::{BATCH, Member};
 pub(crate) use socket::{LinkedOwners, Neighbour};
 
 use std::process::Command;
@@ -23,7 +24,7 @@ use crate::RunArgs;
 use crate::fleet::{BenchFleet, now};
 use crate::process::{memory_kib, own_resident_bytes};
 use crate::report::{Report, Spread, Table, digits};
-use frames::{Member, NAMES_PER_OWNER};
+use frames::NAMES_PER_OWNER;
 use machine::Machine;
 
 /// More than one takes in memory; what does not fit is left out rather than swapped.
