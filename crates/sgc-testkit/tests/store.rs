@@ -165,6 +165,24 @@ fn store_that_returns_empty_is_filled_again() {
 }
 
 #[test]
+fn store_that_returns_without_names_of_a_batch_that_it_has_gets_them_again() {
+    let mut site = Site::new();
+    site.until_granted("/chatter");
+    site.world.run(Duration::from_secs(1));
+    let name = StoreKey::Name(site.world.name(site.robot, "/chatter"));
+    let (before, value) = (site.world.stored(), site.world.stored_value(&name).map(<[u8]>::to_vec));
+    site.world.stop_store();
+    site.world.run(Duration::from_secs(1));
+    site.world.forget_stored(&name);
+    site.world.start_store(true);
+    // Names that are still there are not written: nobody hears of a change.
+    let counts = site.counts_of(|site| site.world.run(Duration::from_secs(2)));
+    assert_eq!((site.world.stored(), site.world.stored_value(&name)), (before, value.as_deref()));
+    assert!(counts.name_writes > 0, "{counts:?}");
+    assert_eq!(site.counts_of(|site| site.world.run(Duration::from_secs(20))).name_writes, 0);
+}
+
+#[test]
 fn names_that_the_store_lost_are_found_by_asking_and_written_again() {
     let mut site = Site::new();
     let name = StoreKey::Name(site.world.name(site.robot, "/chatter"));

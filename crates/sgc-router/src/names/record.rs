@@ -141,7 +141,7 @@ impl Record {
     }
 
     /// Returns the number of names that no newer record speaks for.
-    pub(super) fn live(&self) -> usize {
+    pub(crate) fn live(&self) -> usize {
         self.live
     }
 

@@ -84,8 +84,11 @@ impl Router {
         let records = self.names.records_of(attached).map(Work::Record);
         let wanted = self.names.watched().filter(|name| !self.names.is_own(name)).copied().map(Work::LookUp);
         let work: Vec<_> = nodes.chain(wanted).chain(records).collect();
+        let names =
+            self.names.records_of(attached).filter_map(|id| Some((id, self.names.record(id)?.live())));
         if let Some(store) = &mut self.store {
             store.add_paced(self.now.instant, work);
+            store.refill(names);
         }
     }
 
@@ -174,17 +177,18 @@ impl Router {
                     store.write(StoreKey::Node(node), value, Some(lifetime), work, None);
                 }
             }
-            Work::NewRecord(id) | Work::Record(id) | Work::NamesOf(id) => {
+            Work::NewRecord(id) | Work::Record(id) | Work::NamesOf(id) | Work::Refill(id) => {
                 let Some(record) = self.names.record(id) else { return };
                 let lifetime = record.expires().saturating_duration_since(now);
                 let entry = record.store_entry();
                 if !self.links.is_attached(&entry.owner) || lifetime < LIFETIME_MIN {
                     return;
                 }
-                if !matches!(work, Work::NamesOf(_)) {
+                if matches!(work, Work::NewRecord(_) | Work::Record(_)) {
                     let value = encode_signed(record.signed());
                     return store.write(entry.batch(), value, Some(lifetime), work, Some(Work::NamesOf(id)));
                 }
+                store.need_not_refill(id);
                 // A withdrawn name ends with its withdrawal.
                 let lifetime = (record.kind() == RecordKind::Withdrawal).then_some(lifetime);
                 let value = entry.to_bytes();

@@ -36,6 +36,8 @@ const RETRY_MIN: Duration = Duration::from_secs(1);
 const RETRY_MAX: Duration = Duration::from_secs(32);
 /// Time between two steps of the work that a store needs when it answers again.
 const PACE: Duration = Duration::from_micros(500);
+/// Time for each name that is written again when a store answers again although it has the batch of the name.
+const NAME_PACE: Duration = Duration::from_millis(2);
 /// Batches whose first write may have reached the store although it failed. Names of further ones are written when a
 /// question shows that the store lacks them.
 const UNSURE_MAX: usize = 16_384;
@@ -80,6 +82,8 @@ pub(crate) enum Work {
     Record(RecordId),
     /// Write the names of a record.
     NamesOf(RecordId),
+    /// Write the names of a record that the store does not have.
+    Refill(RecordId),
     /// Write one name if the store has lost it.
     Check(Name),
 }
@@ -197,6 +201,9 @@ pub(crate) struct Store {
     work: BTreeSet<Work>,
     /// Work that is due at a time.
     later: BTreeSet<(Instant, Work)>,
+    /// Records whose names are written again one after another, with the number of these, and the time of the next.
+    refills: BTreeMap<RecordId, usize>,
+    refill_at: Instant,
     /// Work to be repeated because a write failed.
     repetitions: BTreeMap<Work, Instant>,
     /// Batches that the store may have got from a first write that failed, without their names.
@@ -219,6 +226,8 @@ impl Store {
             look_ups: BTreeMap::new(),
             work: BTreeSet::new(),
             later: BTreeSet::new(),
+            refills: BTreeMap::new(),
+            refill_at: now,
             repetitions: BTreeMap::new(),
             unsure: BTreeSet::new(),
             failures_in_row: 0,
@@ -232,7 +241,11 @@ impl Store {
         StoreStats {
             cached: self.cache.len(),
             cached_bytes: self.cache.bytes(),
-            pending: self.under_way.len() + self.waiting.len() + self.work.len() + self.later.len(),
+            pending: self.under_way.len()
+                + self.waiting.len()
+                + self.work.len()
+                + self.later.len()
+                + self.refills.len(),
             ..self.stats
         }
     }
@@ -281,12 +294,19 @@ impl Store {
             }
             self.work.insert(work);
         }
+        if self.refill_at <= now
+            && let Some((id, names)) = self.refills.pop_first()
+        {
+            self.refill_at = now + NAME_PACE * u32::try_from(names).unwrap_or(u32::MAX);
+            self.work.insert(Work::Refill(id));
+        }
     }
 
     /// Returns the times of the next timeouts.
     pub(crate) fn deadlines(&self) -> impl Iterator<Item = Instant> {
         let overdue = self.under_way.first_key_value().map(|(_, op)| op.began + OP_TIMEOUT);
-        overdue.into_iter().chain(self.later.first().map(|(at, _)| *at))
+        let refill = (!self.refills.is_empty()).then_some(self.refill_at);
+        overdue.into_iter().chain(self.later.first().map(|(at, _)| *at)).chain(refill)
     }
 
     /// Returns the next news for the router.
@@ -508,6 +528,17 @@ impl Store {
         }
     }
 
+    /// Lets the names of these records be written again, those that the store does not have: a server that lost them may
+    /// not be the one with their batch. Each record comes with the number of its names.
+    pub(crate) fn refill(&mut self, records: impl IntoIterator<Item = (RecordId, usize)>) {
+        self.refills = records.into_iter().collect();
+    }
+
+    /// Notes that all names of a record are written.
+    pub(crate) fn need_not_refill(&mut self, id: RecordId) {
+        self.refills.remove(&id);
+    }
+
     /// Returns the next work, if there is room for its writes.
     pub(crate) fn take_work(&mut self) -> Option<Work> {
         if self.writes >= WRITES_MAX { None } else { self.work.pop_first() }
@@ -525,7 +556,9 @@ impl Store {
         if value.len() > STORE_VALUE_BYTES_MAX {
             return self.refuse(&[]);
         }
-        let action = StoreAction::Write { value, lifetime, condition: WriteIf::Always };
+        // A name that is there keeps its value, so that no router that read it hears of a change.
+        let condition = if matches!(work, Work::Refill(_)) { WriteIf::Absent } else { WriteIf::Always };
+        let action = StoreAction::Write { value, lifetime, condition };
         self.push_write(key, action, Purpose::Write { work, then });
     }
 

@@ -267,6 +267,29 @@ fn work_at_the_return_of_the_store_is_spread() {
 }
 
 #[test]
+fn names_are_written_again_one_record_after_another() {
+    let mut now = Clock::default().now().instant;
+    let mut store = up(now);
+    store.refill([(1, 100), (2, 1), (3, 5), (4, 1)]);
+    store.need_not_refill(4);
+    for (id, wait) in [(1, 100 * NAME_PACE), (2, NAME_PACE)] {
+        assert_eq!(store.deadlines().min(), Some(now));
+        store.handle_timeout(now);
+        assert_eq!(store.take_work(), Some(Work::Refill(id)));
+        now += wait;
+        store.handle_timeout(now - Duration::from_micros(1));
+        assert_eq!(store.take_work(), None);
+    }
+    // The store failed once more: what was left is part of the new work.
+    store.refill([(3, 5)]);
+    store.handle_timeout(now);
+    assert_eq!((store.take_work(), store.deadlines().min()), (Some(Work::Refill(3)), None));
+    store.write(StoreKey::Name(name(1)), Bytes::new(), None, Work::Refill(3), None);
+    let op = operations(&mut store, now).remove(0);
+    assert!(matches!(op.action, StoreAction::Write { condition: WriteIf::Absent, .. }));
+}
+
+#[test]
 fn tag_does_not_depend_on_the_order_of_names() {
     assert_eq!(batch_tag(&[name(1), name(2)]), batch_tag(&[name(2), name(1)]));
     assert_ne!(batch_tag(&[name(1), name(2)]), batch_tag(&[name(1)]));
