@@ -111,7 +111,8 @@ fn measure(args: &RunArgs, home: Arc<Namespace>, batches: usize) -> Result<(Vec<
                 let turn = (turn + batch) % MAPPINGS.len();
                 sides[turn].look_up(batch).await?;
             }
-            let stored = sides.iter().find(|side| side.mapping == "store").context("a side with the store")?;
+            let stored =
+                sides.iter().find(|side| side.mapping == "store").context("a side with the store")?;
             reads.push(store.read(stored.wanted[batch].1).await?);
         }
         anyhow::Ok(Spread::from_samples(reads))
@@ -143,16 +144,17 @@ impl Side {
         for dir in [&near_dir, &far_dir] {
             std::fs::create_dir(dir)?;
         }
-        let near_identity = fleet.write_router(&near_dir)?;
-        fleet.write_router(&far_dir)?;
+        let near_id = fleet.write_router_of(&near_dir, "near")?;
+        fleet.write_router_of(&far_dir, "far")?;
         let near = SgcRouter::start_as("quic", sgc, &near_dir, "", &keys)?;
-        let far = SgcRouter::start_as("quic", sgc, &far_dir, &format!("routers = [{:?}]\n", near.url), &keys)?;
+        let far =
+            SgcRouter::start_as("quic", sgc, &far_dir, &format!("routers = [{:?}]\n", near.url), &keys)?;
 
         let mut rng = ChaCha20Rng::seed_from_u64(5);
         let (mut owners, mut wanted) = (Vec::new(), Vec::new());
         for n in 0..batches.div_ceil(OWNER_BATCHES) {
             let identity = fleet.issue(&format!("owner-{n}"), false)?;
-            let end = End::connect(&near.url, Arc::clone(&identity), Some(near_identity)).await?;
+            let end = End::connect(&near.url, Arc::clone(&identity), Some(near_id)).await?;
             let mut owner = Member::new(identity, end);
             for _ in 0..OWNER_BATCHES.min(batches - wanted.len()) {
                 let advert = owner.advert(BATCH, now().unix, &mut rng);

@@ -28,19 +28,26 @@ impl BenchFleet {
     }
 
     /// Writes the identity of a router where [`crate::process::SgcRouter`] looks for it.
-    pub(crate) fn write_router(&self, dir: &Path) -> Result<NodeId> {
+    pub(crate) fn write_router(&self, dir: &Path) -> Result<()> {
         self.write(dir, "router", true)
     }
 
-    /// Writes `NODE.identity`, as `sgc fleet enroll` does. Returns the node's id.
-    pub(crate) fn write(&self, dir: &Path, node: &str, router: bool) -> Result<NodeId> {
-        let mut options = fs::OpenOptions::new();
-        let path = dir.join(format!("{node}.identity"));
-        let mut file = options.write(true).create_new(true).mode(0o600).open(path)?;
-        let identity = self.issue(node, router)?;
-        file.write_all(identity.to_text().as_bytes())?;
+    /// Writes that of a router with another name to the same place. Returns its id.
+    pub(crate) fn write_router_of(&self, dir: &Path, node: &str) -> Result<NodeId> {
+        let identity = self.issue(node, true)?;
+        write(&dir.join("router.identity"), &identity)?;
         Ok(identity.node_id())
     }
+
+    /// Writes `NODE.identity`, as `sgc fleet enroll` does.
+    pub(crate) fn write(&self, dir: &Path, node: &str, router: bool) -> Result<()> {
+        write(&dir.join(format!("{node}.identity")), &*self.issue(node, router)?)
+    }
+}
+
+fn write(path: &Path, identity: &Identity) -> Result<()> {
+    let mut file = fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
+    Ok(file.write_all(identity.to_text().as_bytes())?)
 }
 
 /// The present, by both clocks.
