@@ -1,15 +1,18 @@
 //! Real servers of a store for tests and benchmarks: `redis-server` processes in a network namespace, alone or as a
-//! cluster, that can be killed, cut off and resharded.
+//! cluster, that can be killed, frozen, cut off and resharded.
 //!
 //! Redis 7.0 is the last version under a free licence and the one of Debian 12, which has no Valkey yet. Valkey 7.2 and
 //! later speak the same protocol: [`RedisOptions::program`] can name `valkey-server`.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 use std::sync::Arc;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
 
 use crate::netsim::{Namespace, NetsimError};
 
@@ -169,6 +172,22 @@ impl Redis {
         }
     }
 
+    /// Stops a server where it is, as a host that hangs: it keeps its connections and answers nothing.
+    pub fn freeze(&self, index: usize) {
+        self.signal(index, Signal::STOP);
+    }
+
+    /// Ends what [`Self::freeze`] did.
+    pub fn thaw(&self, index: usize) {
+        self.signal(index, Signal::CONT);
+    }
+
+    fn signal(&self, index: usize, signal: Signal) {
+        if let Some(process) = &self.servers[index].process {
+            kill_process(Pid::from_child(process), signal).expect("the server takes signals");
+        }
+    }
+
     /// Returns the addresses of the servers, as URLs.
     pub fn urls(&self) -> Vec<String> {
         let scheme = if self.options.tls.is_some() { "valkeys" } else { "valkey" };
@@ -196,6 +215,18 @@ impl Redis {
         }
         args.extend(command);
         self.namespace.run("redis-cli", &args)
+    }
+
+    /// Returns the keys that match a pattern, of all primaries that can be reached, as `redis-cli` shows them. Waits for
+    /// servers that are frozen.
+    pub fn keys(&self, pattern: &str) -> BTreeSet<String> {
+        let is_primary = |index: &usize| {
+            let replication = self.try_cli(*index, &["INFO", "replication"]);
+            replication.is_some_and(|replication| replication.contains("role:master"))
+        };
+        let keys_of = |index| self.try_cli(index, &["--no-raw", "KEYS", pattern]).unwrap_or_default();
+        let shown: Vec<String> = (0..self.servers.len()).filter(is_primary).map(keys_of).collect();
+        shown.iter().flat_map(|shown| shown_keys(shown)).map(str::to_owned).collect()
     }
 
     /// Returns the id of a server in its cluster.
@@ -249,7 +280,7 @@ impl Redis {
         // Keys are bytes: `redis-cli` shows them in quotes and takes them so.
         let shown =
             self.cli(from, &["--no-raw", "CLUSTER", "GETKEYSINSLOT", &slot.to_string(), KEYS_AT_ONCE]);
-        for key in shown.lines().filter_map(|line| line.split_once(") ")).map(|(_, key)| key) {
+        for key in shown_keys(&shown) {
             self.ok(from, &["--quoted-input", "MIGRATE", host, &port, key, "0", "5000"]);
         }
     }
@@ -308,6 +339,11 @@ impl Redis {
             sleep(Duration::from_millis(20));
         }
     }
+}
+
+/// Returns the keys of a list as `redis-cli --no-raw` shows it.
+fn shown_keys(list: &str) -> impl Iterator<Item = &str> {
+    list.lines().filter_map(|line| line.split_once(") ")).map(|(_, key)| key)
 }
 
 impl Drop for Redis {
