@@ -31,7 +31,7 @@ help:
 	@echo '                 image, image-test (the image of a container, with podman; root)'
 	@echo '                 book (the documents as a book, target/book/index.html; builds mdbook once)'
 	@echo '                 peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
-	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS; SGC_RING_DIR keeps the logs)'
+	@echo '                 ring (two minutes of faults, without and with a store; SGC_RING_SEED, SGC_RING_SECONDS; SGC_RING_DIR keeps the logs)'
 	@echo '                 churn (200 random restarts; SGC_CHURN_SEED, SGC_CHURN_STEPS)'
 	@echo '                 stall (ten minutes of images to a stalled subscriber; SGC_STALL_SECONDS)'
 	@echo '                 soak (20 nodes for two hours; SGC_SOAK_SECONDS, SGC_SOAK_SEED; SGC_SOAK_DIR keeps logs and samples; root)'
@@ -181,7 +181,8 @@ peers-check: peers
 peers-check-long: peers
 	.venv/bin/python -B tests/peers/check.py --long
 
-# Cuts the links of five routers and kills routers at random. Prints its seed, a new one each time. The suite runs a short one.
+# Cuts the links of five routers and kills routers at random, and then, with a store of names, also servers of the store. Prints
+# its seed, a new one each time. The suite runs a short one. With the store alone: ARGS=with_a_store.
 ring: peers
 	SGC_RING_SEED=$${SGC_RING_SEED:-$$(date +%s)} SGC_RING_SECONDS=$${SGC_RING_SECONDS:-120} \
 		$(CARGO) test -p sgc $(FEATURES) --locked --test ring $(ARGS) -- --nocapture

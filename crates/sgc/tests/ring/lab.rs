@@ -1,6 +1,7 @@
-//! The ring as processes: a namespace for each node, a cable for each link, and functions that break them. The lab ends
-//! its processes by their process ids and removes its namespaces, also when a test panics.
+//! The ring as processes: a namespace for each node, a cable for each link, a store of names if wanted, and functions
+//! that break them. The lab ends its processes by their process ids and removes its namespaces, also when a test panics.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
@@ -13,6 +14,7 @@ use sgc_testkit::netsim::{Namespace, NetsimError};
 use tempfile::TempDir;
 
 use crate::graph::{Edge, End, Fault, Graph, NODES, Node};
+use crate::store::Store;
 use crate::support::{self, Peer, Running, say_log};
 
 const PORT: u16 = 7447;
@@ -27,17 +29,20 @@ pub(crate) struct Lab {
     peer_life: String,
     _temporary: Option<TempDir>,
     nodes: [Option<Running>; NODES.len()],
+    store: Option<Store>,
     /// `None` where the kernel or the user cannot make namespaces.
     namespaces: Option<[Namespace; NODES.len()]>,
 }
 
 impl Lab {
     /// A fleet, and all nodes running; the robot shares `topics`. Files go to a directory of their own in `keep`, if
-    /// given, and stay there.
-    pub(crate) fn new(topics: &[&str], keep: Option<PathBuf>, peer_life: Duration) -> Self {
+    /// given, and stay there. A store needs namespaces ([`Self::can_be_apart`]).
+    pub(crate) fn new(topics: &[&str], keep: Option<PathBuf>, peer_life: Duration, has_store: bool) -> Self {
         let temporary = keep.is_none().then(|| tempfile::tempdir().unwrap());
         let dir = match keep {
-            Some(keep) => keep.join(std::process::id().to_string()),
+            Some(keep) => {
+                keep.join(format!("{}{}", std::process::id(), if has_store { "-store" } else { "" }))
+            }
             None => temporary.as_ref().unwrap().path().to_owned(),
         };
         fs::create_dir_all(&dir).unwrap();
@@ -47,14 +52,25 @@ impl Lab {
             peer_life: peer_life.as_secs().to_string(),
             _temporary: temporary,
             nodes: [const { None }; NODES.len()],
+            store: None,
             namespaces: support::namespaces(make_namespaces(), "one host, and no link is cut"),
         };
+        if has_store {
+            let routers = Node::routers().map(|router| (router, lab.namespace(router).unwrap()));
+            lab.store = Some(Store::start(namespace_name("store"), &lab.dir.join("store"), routers));
+        }
         let members = NODES
             .map(|node| format!("{}{}", node.name(), if node.is_router() { " --role router" } else { "" }));
         support::enroll(&lab.dir, members.iter().map(String::as_str));
         NODES.into_iter().for_each(|node| lab.write_config(node, topics));
         NODES.into_iter().for_each(|node| lab.start(node));
         lab
+    }
+
+    /// Returns `false` where namespaces cannot be made, and says what is not tested then.
+    pub(crate) fn can_be_apart() -> bool {
+        let made = Namespace::create(namespace_name("try"));
+        support::namespaces(made, "a ring with a store is not tested").is_some()
     }
 
     /// Returns `false` where networks are not separate for lack of namespaces.
@@ -79,6 +95,7 @@ impl Lab {
         );
         if node.is_router() {
             text += &format!("[router]\nlisten = [\"quic://{}\"]\n", self.listens_at(node));
+            text += &self.store.as_ref().map(Store::config).unwrap_or_default();
         } else {
             let domain = self.domain(node);
             text +=
@@ -148,6 +165,9 @@ impl Lab {
             Fault::Isolate { cut: true, .. } => {
                 fault.edges().into_iter().for_each(|edge| self.set_interface(edge, End::Dialling, "down"));
             }
+            Fault::Store(fault) => {
+                self.store.as_mut().unwrap().inflict(fault, self.namespaces.as_ref().unwrap());
+            }
         }
     }
 
@@ -167,6 +187,9 @@ impl Lab {
             }
             Fault::Isolate { cut: true, .. } => {
                 fault.edges().into_iter().for_each(|edge| self.set_interface(edge, End::Dialling, "up"));
+            }
+            Fault::Store(fault) => {
+                self.store.as_mut().unwrap().mend(fault, self.namespaces.as_ref().unwrap());
             }
         }
     }
@@ -220,6 +243,11 @@ impl Lab {
         graph
     }
 
+    /// Returns the names that the store has, while none of its servers is stopped.
+    pub(crate) fn stored_names(&self) -> BTreeSet<String> {
+        self.store.as_ref().map(Store::names).unwrap_or_default()
+    }
+
     /// Returns the resident memory of a node in kB, or `None` if it is not running.
     pub(crate) fn resident(&self, node: Node) -> Option<u64> {
         let pid = self.nodes[node.0].as_ref()?.pid();
@@ -250,7 +278,7 @@ impl Drop for Lab {
 fn make_namespaces() -> Result<[Namespace; NODES.len()], NetsimError> {
     let mut made = Vec::new();
     for node in NODES {
-        made.push(Namespace::create(format!("{PREFIX}-{}-{}", std::process::id(), node.name()))?);
+        made.push(Namespace::create(namespace_name(node.name()))?);
     }
     for edge in Edge::all() {
         let interface = interface(edge);
@@ -260,6 +288,10 @@ fn make_namespaces() -> Result<[Namespace; NODES.len()], NetsimError> {
         near.veth((&interface, &[&dialling]), far, (&interface, &[&listening]))?;
     }
     Ok(made.try_into().unwrap())
+}
+
+fn namespace_name(place: &str) -> String {
+    format!("{PREFIX}-{}-{place}", std::process::id())
 }
 
 /// The same at both ends, which are not in one namespace.

@@ -92,7 +92,8 @@ impl Listener {
 
     /// Returns the longest time without a message that began between two moments.
     pub(crate) fn outage(&self, from: Instant, to: Instant) -> Option<Duration> {
-        let pauses = self.got.windows(2).filter(|pair| (from..to).contains(&pair[0].0));
+        let begin = self.got.partition_point(|(at, _)| *at < from);
+        let pauses = self.got[begin..].windows(2).take_while(|pair| pair[0].0 < to);
         pauses.map(|pair| pair[1].0 - pair[0].0).max()
     }
 
