@@ -169,6 +169,9 @@ impl Records {
     /// Returns the names that a record still speaks for.
     pub(super) fn live_names(&self, id: RecordId) -> Vec<Name> {
         let Some(record) = self.records.get(&id) else { return Vec::new() };
+        if !record.is_partly_void() {
+            return record.names().to_vec();
+        }
         record.names().iter().copied().filter(|name| self.words.get(name) == Some(&id)).collect()
     }
 
