@@ -21,6 +21,7 @@ use sgc_wire::{
     RosNode, SecretBytes, SecretGeneration, SignedBody, SinkId, SourceId, SourceOffer, TopicGrant,
     TypeQuestion, UnixMillis,
 };
+use sgc_zenoh::{Attachment, Gid, ZenohId};
 
 /// The time of the targets.
 const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
@@ -49,6 +50,7 @@ fn main() -> io::Result<()> {
     write("checks", checks())?;
     write("grants", grants())?;
     write("store", store())?;
+    write("zenoh", zenoh())?;
     write("gateway", gateway())
 }
 
@@ -96,6 +98,40 @@ fn store() -> Vec<Vec<u8>> {
         with(&slots, b"-ASK 5 b:2\r\n"),
         with(&slots, b">2\r\n+invalidate\r\n*1\r\n+sgc:n:\r\n"),
         with(&single, b"-READONLY\r\n"),
+    ]
+}
+
+/// Returns attachments of both forms, tokens, a key, QoS and an id of SGC, as rmw_zenoh writes them.
+fn zenoh() -> Vec<Vec<u8>> {
+    const STRING: &str = "std_msgs::msg::dds_::String_";
+    const HASH: &str = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18";
+    let attachment =
+        Attachment { sequence: 1, source_timestamp_ns: 1_700_000_000_123_456_789, gid: Gid([7; 16]) };
+    let old = [
+        b"\x0fsequence_number".as_slice(),
+        &[1; 8],
+        b"\x10source_timestamp",
+        &[2; 8],
+        b"\x0asource_gid\x10",
+        &[3; 16],
+    ];
+    let node = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%arm/%robot1/talker".to_owned();
+    let endpoint = |kind: &str, name: &str, qos: &str| {
+        format!(
+            "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/10/{kind}/%/%/talker/{name}/{STRING}/{HASH}/{qos}"
+        )
+    };
+    let with = |choice: u8, bytes: &[u8]| [&[choice], bytes].concat();
+    vec![
+        with(0, &attachment.encode()),
+        with(0, &old.concat()),
+        with(1, node.as_bytes()),
+        with(1, endpoint("MP", "%chatter", ":1:,1000:,:10,0:,,").as_bytes()),
+        with(1, endpoint("MS", "%robot1%chatter", "2:2:2,:1,5:,:3,2,0/backends:cpu:").as_bytes()),
+        with(1, endpoint("SS", "%add", "::,10:,:,:,,").as_bytes()),
+        with(2, format!("0/robot1/chatter/{STRING}/{HASH}").as_bytes()),
+        with(3, b"1:1:1,42:9223372036,854775807:0,1:4,9223372036,1"),
+        with(4, ZenohId::of_sgc([9; 10]).to_string().as_bytes()),
     ]
 }
 

@@ -31,6 +31,7 @@ pub mod packet;
 pub mod sink;
 pub mod store;
 pub mod values;
+pub mod zenoh;
 
 /// Body of a fuzz target.
 pub type Target = fn(&[u8]);
@@ -53,6 +54,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("sink", sink::run),
     ("store", store::run),
     ("values", values::run),
+    ("zenoh", zenoh::run),
 ];
 
 /// Returns identities of one fleet that are valid now.
