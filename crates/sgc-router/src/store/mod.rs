@@ -47,6 +47,8 @@ const UNSURE_MAX: usize = 16_384;
 pub struct StoreStats {
     /// Time since which the store does not answer; `None` while it does.
     pub down_since: Option<Instant>,
+    /// Time of the last operation that the store refused; `None` if it carried out a write since.
+    pub refused_at: Option<Instant>,
     /// Values that are kept.
     pub cached: usize,
     /// Memory of them, bytes.
@@ -336,6 +338,12 @@ impl Store {
         let Operation { key, purpose, .. } = operation;
         if result.is_err() {
             self.stats.failures += 1;
+        }
+        match &result {
+            Err(StoreFailure::Refused) => self.stats.refused_at = Some(now),
+            // Rights and memory may suffice for reading, and not for writing.
+            Ok(StoreReply::Written { .. }) => self.stats.refused_at = None,
+            _ => {}
         }
         match purpose {
             Purpose::Read => match result {

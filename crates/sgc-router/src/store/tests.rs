@@ -186,6 +186,25 @@ fn work_whose_writes_fail_is_repeated_once_and_later_each_time() {
 }
 
 #[test]
+fn refusals_are_told_until_a_write_succeeds() {
+    let now = Clock::default().now().instant;
+    let mut store = up(now);
+    let write = |store: &mut Store, result| {
+        store.write(StoreKey::Name(name(1)), Bytes::new(), None, Work::NamesOf(3), None);
+        let op = operations(store, now).remove(0);
+        answer(store, now, &op, result);
+        store.stats().refused_at
+    };
+    assert_eq!(write(&mut store, Err(StoreFailure::Unreachable)), None);
+    assert_eq!(write(&mut store, Err(StoreFailure::Refused)), Some(now));
+    store.look_up(now, name(2));
+    let read = operations(&mut store, now).remove(0);
+    answer(&mut store, now, &read, Ok(StoreReply::Value(None)));
+    assert_eq!(store.stats().refused_at, Some(now));
+    assert_eq!(write(&mut store, Ok(StoreReply::Written { existed: true })), None);
+}
+
+#[test]
 fn writes_bound_the_work_that_begins() {
     let now = Clock::default().now().instant;
     let mut store = up(now);

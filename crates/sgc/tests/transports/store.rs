@@ -150,6 +150,15 @@ fn router_with_a_wrong_password_and_routers_without_the_store_find_names_by_aski
     let finding = &report["findings"][0];
     assert_eq!(finding["severity"], "error");
     assert!(finding["fix"].as_str().unwrap().contains("store_password_file"), "{finding}");
+
+    // Names of the robots stay in the store; of the next one, nothing can be written.
+    assert_eq!(redis.cli(0, &["ACL", "SETUSER", "router", "-set"]).trim(), "OK");
+    let (shares, uses) = rules("robot-late", "desk-late");
+    let urls = [7447, 7501].map(|port: u16| format!("quic://10.10.0.1:{port}"));
+    let late = Pair::between(&lab, ["robot-late", "desk-late"], [&shares, &uses], [&urls[0], &urls[1]]);
+    late.wait_for("never begins", |_| 1);
+    eventually("the router says that it is refused", || alerts(&right) == ["store_refuses"]);
+    late.flows.iter().for_each(|flow| flow.end());
     for pair in &pairs {
         pair.wait_for("does not stay", |flow| flow.said() + 1);
         pair.flows.iter().for_each(|flow| flow.end());

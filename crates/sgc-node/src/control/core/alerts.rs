@@ -27,6 +27,8 @@ const UNSENT_SHOWN_S: u64 = 60;
 /// Seconds without an answer after which the store counts as down: more than a router needs to connect to it, and than a
 /// cluster needs to replace a server.
 const STORE_DOWN_SHOWN_S: u64 = 5;
+/// Seconds for which a refusal of the store is shown. It exceeds the pause before a write that failed is repeated.
+const STORE_REFUSAL_SHOWN_S: u64 = 60;
 
 impl<N: RosNetwork> Core<N> {
     /// Closes the link of a run that another run of the same node superseded. A run that returns after it was told so
@@ -148,11 +150,13 @@ impl<N: RosNetwork> Core<N> {
         let closed = self.reopening.failure().map(str::to_owned);
         alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
         alerts.extend(self.storage.alert().into_iter().chain(self.audit.alert()));
-        let store_down = self.router.store_stats().and_then(|store| store.down_since);
-        alerts.extend(store_down.and_then(|since| {
-            let ago_s = now.instant.saturating_duration_since(since).as_secs();
-            (ago_s >= STORE_DOWN_SHOWN_S).then_some(Alert::StoreDown { ago_s })
-        }));
+        if let Some(store) = self.router.store_stats() {
+            let ago_s = |at: Instant| now.instant.saturating_duration_since(at).as_secs();
+            let down = store.down_since.map(ago_s).filter(|ago_s| *ago_s >= STORE_DOWN_SHOWN_S);
+            alerts.extend(down.map(|ago_s| Alert::StoreDown { ago_s }));
+            let refused = store.refused_at.map(ago_s).filter(|ago_s| *ago_s < STORE_REFUSAL_SHOWN_S);
+            alerts.extend(refused.map(|ago_s| Alert::StoreRefuses { ago_s }));
+        }
         alerts.extend(strangers::alerts());
         alerts.extend(self.owners_here().into_iter().map(|node| Alert::SameLocalNetwork { node }));
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {

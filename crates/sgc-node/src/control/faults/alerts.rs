@@ -145,6 +145,11 @@ pub enum Alert {
         /// Seconds since the router noticed it.
         ago_s: u64,
     },
+    /// The store of names refuses what this router wants to read or write: rights or memory are missing.
+    StoreRefuses {
+        /// Seconds since the last refusal.
+        ago_s: u64,
+    },
     /// The audit log cannot be written.
     AuditNotWritten {
         /// The file.
@@ -250,6 +255,10 @@ impl Alert {
                 "`sgc router store check` tells what is wrong with it. Names that are in use go on, and other names are asked of all \
                  routers until it answers"
             }
+            Self::StoreRefuses { .. } => {
+                "`sgc router store check` tells which right is missing, or whether its memory is full. The router writes again by itself, \
+                 and its names are found by asking routers until then"
+            }
             Self::AuditNotWritten { .. } => {
                 "free space on its disk or mount it to be written, or name another file with `file` in [audit]. The node tries again by \
                  itself"
@@ -341,6 +350,9 @@ impl fmt::Display for Alert {
             }
             Self::StoreDown { ago_s } => {
                 write!(f, "the store of names has not answered for {ago_s} s, so new names are found more slowly")
+            }
+            Self::StoreRefuses { ago_s } => {
+                write!(f, "the store of names refused this router {ago_s} s ago, so names from here may be found more slowly")
             }
             Self::AuditNotWritten { path, reason } => {
                 write!(f, "the audit log {path} cannot be written, and events are lost from it: {reason}")
