@@ -1,10 +1,9 @@
-//! Services of [`CycloneNetwork`] between participants that talk over the loopback interface. An untagged network
-//! stands for a plain ROS 2 process.
+//! Services of [`CycloneNetwork`] between participants that talk over the loopback interface, beside those of every
+//! network (`conformance.rs`). An untagged network stands for a plain ROS 2 process.
 
 #![allow(clippy::unwrap_used)]
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
-use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -154,83 +153,4 @@ fn the_header_is_that_of_rmw_cyclonedds() {
     // A payload that is too short for an id is dropped.
     writer.write(SampleKind::Write, 1, vec![0, 1, 0, 0, 1, 2, 3, 4].into()).unwrap();
     quiet(&requests);
-}
-
-#[test]
-fn a_request_without_a_server_says_so_and_sgc_does_not_call_itself() {
-    let (first, second) = (open(122, Some("a")), open(122, Some("b")));
-    let (client, _replies) = client(&first);
-    let (_server, requests) = server(&second);
-    let refused = client.request(Bytes::from_static(&[0, 1, 0, 0]));
-    assert!(matches!(refused, Err(RosError::NoPeer { .. })), "{refused:?}");
-    assert_eq!(client.matched_servers(), 0);
-    quiet(&requests);
-}
-
-/// The programs behind a gateway share one participant.
-#[test]
-fn programs_behind_one_network_without_tag_call_each_other() {
-    let ros = open(148, None);
-    let (server, requests) = server(&ros);
-    let clients = [client(&ros), client(&ros)];
-    for (n, (client, replies)) in clients.iter().enumerate() {
-        let asked = ask(client, &[0, 1, 0, 0, 1, 2, 3, n as u8]);
-        let (id, payload) = next(&requests);
-        assert_eq!((id.client, id.number), (asked.client, asked.number));
-        assert_eq!(payload, [0, 1, 0, 0, 1, 2, 3, n as u8].as_slice());
-        server.reply(&id, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])).unwrap();
-        assert_eq!(next(replies), (asked, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])));
-    }
-    clients.iter().for_each(|(_, replies)| quiet(replies));
-    quiet(&requests);
-}
-
-#[test]
-fn a_server_made_anew_answers_what_the_one_before_was_asked() {
-    let (ros, sgc) = (open(123, None), open(123, Some("arm-1")));
-    let (client, replies) = client(&ros);
-    let (first, requests) = server(&sgc);
-    let asked = ask(&client, &[0, 1, 0, 0]);
-    let (id, _) = next(&requests);
-    drop(first);
-    let (second, _requests) = server(&sgc);
-    second.reply(&id, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])).unwrap();
-    assert_eq!(next(&replies), (asked, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])));
-    drop(client);
-    // The new server answers once its participant has discovered the client.
-    let end = std::time::Instant::now() + PATIENCE;
-    let gone = loop {
-        match second.reply(&id, Bytes::from_static(&[0, 1, 0, 0])) {
-            Ok(()) if std::time::Instant::now() < end => std::thread::sleep(Duration::from_millis(2)),
-            answer => break answer,
-        }
-    };
-    assert!(matches!(gone, Err(RosError::NoPeer { .. })), "{gone:?}");
-}
-
-/// Requests are sent on the caller's thread while replies arrive on another.
-#[test]
-fn many_calls_at_once_are_each_answered_once() {
-    const CALLS: usize = 300;
-    let (ros, sgc) = (open(124, None), open(124, Some("arm-1")));
-    let (tx, requests) = channel();
-    let answers = Arc::new(Mutex::new(None::<CycloneServer>));
-    let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
-    *answers.lock().unwrap() = Some(ros.create_server(&spec(), handler).unwrap());
-    let answering = answers.clone();
-    let echo = std::thread::spawn(move || {
-        for (id, payload) in requests.iter().take(CALLS) {
-            answering.lock().unwrap().as_ref().unwrap().reply(&id, payload).unwrap();
-        }
-    });
-    let (client, replies) = client(&sgc);
-    let payload = |n: usize| [vec![0, 1, 0, 0], (n as u32).to_le_bytes().to_vec()].concat();
-    let mut open: std::collections::BTreeMap<_, _> =
-        (0..CALLS).map(|n| (ask(&client, &payload(n)), payload(n))).collect();
-    for _ in 0..CALLS {
-        let (id, reply) = next(&replies);
-        assert_eq!(open.remove(&id).as_deref(), Some(&reply[..]));
-    }
-    echo.join().unwrap();
-    quiet(&replies);
 }

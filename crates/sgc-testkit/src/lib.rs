@@ -8,7 +8,8 @@
 //! There is no socket, no thread and no sleep here, and no ROS: nodes publish numbered messages.
 //! Sealing is as in production; the provider's own randomness in signatures decides nothing. Only [`netsim`] is
 //! different: it is a bad network for real processes, in real time, and [`unused_port`] is for their listeners.
-//! [`CountingAllocator`] is for tests of allocations.
+//! [`CountingAllocator`] is for tests of allocations, and [`conformance`] for implementations of
+//! [`RosNetwork`](sgc_ros::RosNetwork).
 //!
 //! ```
 //! use std::time::Duration;
@@ -30,6 +31,7 @@
 mod allocator;
 mod cast;
 mod clock;
+pub mod conformance;
 mod datagrams;
 mod direct;
 mod evil;

@@ -188,7 +188,9 @@ impl FakeDomain {
             let missed: Vec<_> = state
                 .endpoints
                 .values()
-                .filter(|w| reader.is_some() && w.reaches(network.tagged))
+                .filter(|w| {
+                    reader.is_some() && discovered.qos.is_transient_local() && w.reaches(network.tagged)
+                })
                 .filter(|w| matches(&w.discovered, &discovered))
                 .flat_map(|w| w.history.iter().cloned())
                 .collect();
