@@ -3,8 +3,9 @@
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
-use sgc_testkit::conformance::Site;
-use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations};
+use sgc_testkit::conformance::rig::padded;
+use sgc_testkit::conformance::{Site, common_qos};
+use sgc_wire::{Qos, Representations};
 
 /// ROS domains of these tests, which run side by side: from here on, each its own.
 static NEXT_DOMAIN: AtomicU32 = AtomicU32::new(30);
@@ -42,27 +43,13 @@ impl Site for Domain {
         self.open_as(tag, true)
     }
 
-    /// With zeros up to a multiple of four, and their number in the pad bits.
     fn received(payload: &[u8]) -> Vec<u8> {
-        let mut payload = payload.to_vec();
-        let pad = payload.len().wrapping_neg() % 4;
-        payload[3] = (payload[3] & !3) | pad as u8;
-        payload.resize(payload.len() + pad, 0);
-        payload
+        padded(payload)
     }
 
     fn told_qos() -> Qos {
-        Qos {
-            reliability: Reliability::Reliable,
-            durability: Durability::TransientLocal,
-            history: History::KeepLast(70),
-            deadline_ns: Some(1_500_000_000),
-            lifespan_ns: Some(60_000_000_000),
-            liveliness: Liveliness::ManualByTopic,
-            lease_ns: Some(2_000_000_000),
-            partitions: vec!["left".into(), "right".into()],
-            representations: Representations::XCDR2,
-        }
+        let partitions = vec!["left".into(), "right".into()];
+        Qos { partitions, representations: Representations::XCDR2, ..common_qos() }
     }
 }
 

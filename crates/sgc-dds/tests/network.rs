@@ -20,13 +20,11 @@ use sgc_ros::{
     DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, GraphNode, Guid, HandleSamples, RosError,
     RosNetwork, RosWriter, Sample, SampleHead, SampleKind, UNACKNOWLEDGED_MIN,
 };
+use sgc_testkit::conformance::rig::{
+    self, PATIENCE, QUIET, discover, eventually, matched, next, padded, quiet, read, string_cdr, with, write,
+    writer,
+};
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, RosNode};
-
-/// Longest wait for an event, far beyond what any takes.
-const PATIENCE: Duration = Duration::from_secs(30);
-
-/// Time for which nothing must happen. Wrong events would come within milliseconds.
-const QUIET: Duration = Duration::from_millis(300);
 
 fn config(domain: u32, tag: Option<&str>) -> DdsConfig {
     DdsConfig {
@@ -42,98 +40,7 @@ fn open(domain: u32, tag: Option<&str>) -> CycloneNetwork {
 }
 
 fn spec(topic: &str) -> EndpointSpec {
-    EndpointSpec {
-        topic: format!("rt/{topic}"),
-        type_name: "std_msgs::msg::dds_::String_".into(),
-        keyless: true,
-        asks_key_hash: false,
-        type_hash: None,
-        qos: Qos::default(),
-    }
-}
-
-fn with(spec: EndpointSpec, change: impl FnOnce(&mut Qos)) -> EndpointSpec {
-    let mut spec = spec;
-    change(&mut spec.qos);
-    spec
-}
-
-/// A `std_msgs/String` as CDR, little endian, unpadded.
-fn string_cdr(text: &str) -> Bytes {
-    let mut payload = vec![0, 1, 0, 0];
-    payload.extend((text.len() as u32 + 1).to_le_bytes());
-    payload.extend(text.as_bytes());
-    payload.push(0);
-    payload.into()
-}
-
-/// Returns a payload as a reader receives it: with zeros up to a multiple of four, and their number in the pad bits.
-fn padded(payload: &[u8]) -> Vec<u8> {
-    let mut payload = payload.to_vec();
-    let pad = payload.len().wrapping_neg() % 4;
-    payload[3] = (payload[3] & !3) | pad as u8;
-    payload.resize(payload.len() + pad, 0);
-    payload
-}
-
-fn read(network: &CycloneNetwork, spec: &EndpointSpec) -> (CycloneReader, Receiver<Sample>) {
-    let (tx, rx) = channel();
-    let reader = network
-        .create_reader(
-            spec,
-            Box::new(move |sample: Sample| {
-                let _ = tx.send(sample);
-            }),
-        )
-        .unwrap();
-    (reader, rx)
-}
-
-/// Returns a writer that matches this many readers.
-fn writer(network: &CycloneNetwork, spec: &EndpointSpec, readers: u32) -> CycloneWriter {
-    let writer = network.create_writer(spec).unwrap();
-    matched(&writer, readers);
-    writer
-}
-
-fn matched(writer: &CycloneWriter, readers: u32) {
-    eventually("the readers match", || writer.matched_readers() == readers);
-}
-
-fn eventually(what: &str, mut done: impl FnMut() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
-    while !done() {
-        assert!(Instant::now() < deadline, "waited in vain: {what}");
-        std::thread::sleep(Duration::from_millis(2));
-    }
-}
-
-fn write(writer: &CycloneWriter, payload: &Bytes) {
-    // Writers send no key hash on a topic without keys.
-    let head = SampleHead { key_hash: Some([1; 16]), ..SampleHead::new(SampleKind::Write, 1_000_000_000) };
-    writer.write_ahead(head, payload.clone()).unwrap();
-    writer.flush();
-}
-
-fn next<T>(events: &Receiver<T>) -> T {
-    events.recv_timeout(PATIENCE).expect("an event")
-}
-
-fn quiet<T: std::fmt::Debug>(events: &Receiver<T>) {
-    match events.recv_timeout(QUIET) {
-        Err(RecvTimeoutError::Timeout) => {}
-        other => panic!("nothing was to happen: {other:?}"),
-    }
-}
-
-fn discover(network: &CycloneNetwork) -> Receiver<DiscoveryEvent> {
-    let (tx, rx): (Sender<DiscoveryEvent>, _) = channel();
-    network
-        .discover(Box::new(move |event| {
-            let _ = tx.send(event);
-        }))
-        .unwrap();
-    rx
+    EndpointSpec { type_hash: None, ..rig::spec(topic) }
 }
 
 fn appeared(events: &Receiver<DiscoveryEvent>) -> DiscoveredEndpoint {

@@ -7,7 +7,8 @@ use sgc_ros::{
 };
 use sgc_wire::{Durability, History, Reliability, RosNode};
 
-use super::{HASH, PATIENCE, Site, appeared, discover, next, quiet, read, spec, vanished, with};
+use super::rig::{HASH, PATIENCE, discover, matched, next, quiet, read, spec, with};
+use super::{Site, appeared, vanished};
 
 /// Discovery tells everything about writers and readers, and their ends.
 pub fn discovery_tells_name_type_hash_and_full_qos_and_the_end<S: Site>() {
@@ -54,7 +55,7 @@ pub fn discovery_tells_what_was_there_before<S: Site>() {
     let writers = ["a", "b"].map(|topic| ros.create_writer(&spec(topic)).expect("a writer"));
     let sgc = site.open(Some("arm-1"));
     let (_reader, _samples) = read(&sgc, &spec("b"));
-    super::matched(&writers[1], 1);
+    matched(&writers[1], 1);
 
     let events = discover(&sgc);
     let mut seen = [appeared(&events).topic, appeared(&events).topic];

@@ -4,32 +4,22 @@
 //! stands for a plain ROS 2 program, one with a tag for a proxy. Functions of this module panic if the implementation
 //! does not behave as the documentation of [`RosNetwork`] says.
 //!
-//! What only some networks can do (keys, partitions, acknowledgements, threads of their own) is tested beside them.
+//! Keys, partitions, acknowledgements and threads of their own, which only some networks have, are tested beside them.
 
 mod discovery;
+pub mod rig;
 mod samples;
 mod services;
 
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
-use std::time::{Duration, Instant};
+use std::sync::mpsc::Receiver;
 
-use bytes::Bytes;
-use sgc_ros::{
-    DiscoveredEndpoint, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, RosWriter, Sample, SampleHead,
-    SampleKind,
-};
+use sgc_ros::{DiscoveredEndpoint, DiscoveryEvent, Guid, RosNetwork};
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability};
 
 pub use self::discovery::*;
+use self::rig::{next, string_cdr};
 pub use self::samples::*;
 pub use self::services::*;
-
-/// Longest wait for an event, far beyond what any takes.
-const PATIENCE: Duration = Duration::from_secs(30);
-/// Time for which nothing must happen. Wrong events would come within milliseconds.
-const QUIET: Duration = Duration::from_millis(300);
-/// The hash of `std_msgs/msg/String`.
-const HASH: &str = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18";
 
 /// A place where networks of one implementation meet.
 pub trait Site {
@@ -57,16 +47,7 @@ pub trait Site {
 
     /// Returns the QoS, different from the default in everything that discovery tells.
     fn told_qos() -> Qos {
-        Qos {
-            reliability: Reliability::Reliable,
-            durability: Durability::TransientLocal,
-            history: History::KeepLast(70),
-            deadline_ns: Some(1_500_000_000),
-            lifespan_ns: Some(60_000_000_000),
-            liveliness: Liveliness::ManualByTopic,
-            lease_ns: Some(2_000_000_000),
-            ..Qos::default()
-        }
+        common_qos()
     }
 }
 
@@ -106,85 +87,23 @@ macro_rules! conformance_tests {
     };
 }
 
-/// Returns the spec of an endpoint for strings.
-fn spec(topic: &str) -> EndpointSpec {
-    EndpointSpec {
-        topic: format!("rt/{topic}"),
-        type_name: "std_msgs::msg::dds_::String_".into(),
-        keyless: true,
-        asks_key_hash: false,
-        type_hash: Some(HASH.into()),
-        qos: Qos::default(),
+/// Returns the QoS that every network tells, different from the default in each policy.
+pub fn common_qos() -> Qos {
+    Qos {
+        reliability: Reliability::Reliable,
+        durability: Durability::TransientLocal,
+        history: History::KeepLast(70),
+        deadline_ns: Some(1_500_000_000),
+        lifespan_ns: Some(60_000_000_000),
+        liveliness: Liveliness::ManualByTopic,
+        lease_ns: Some(2_000_000_000),
+        ..Qos::default()
     }
-}
-
-fn with(mut spec: EndpointSpec, change: impl FnOnce(&mut Qos)) -> EndpointSpec {
-    change(&mut spec.qos);
-    spec
-}
-
-/// A `std_msgs/String` as CDR, little endian, unpadded.
-fn string_cdr(text: &str) -> Bytes {
-    let mut payload = vec![0, 1, 0, 0];
-    payload.extend((text.len() as u32 + 1).to_le_bytes());
-    payload.extend(text.as_bytes());
-    payload.push(0);
-    payload.into()
 }
 
 /// Returns a string as a reader gets it.
 fn received<S: Site>(text: &str) -> Vec<u8> {
     S::received(&string_cdr(text))
-}
-
-fn read<N: RosNetwork>(network: &N, spec: &EndpointSpec) -> (N::Reader, Receiver<Sample>) {
-    let (tx, rx) = channel();
-    let handler = Box::new(move |sample: Sample| drop(tx.send(sample)));
-    (network.create_reader(spec, handler).expect("a reader"), rx)
-}
-
-/// Returns a writer that matches this many readers.
-fn writer<N: RosNetwork>(network: &N, spec: &EndpointSpec, readers: u32) -> N::Writer {
-    let writer = network.create_writer(spec).expect("a writer");
-    matched(&writer, readers);
-    writer
-}
-
-fn matched(writer: &impl RosWriter, readers: u32) {
-    eventually("the readers match", || writer.matched_readers() == readers);
-}
-
-fn eventually(what: &str, mut done: impl FnMut() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
-    while !done() {
-        assert!(Instant::now() < deadline, "waited in vain: {what}");
-        std::thread::sleep(Duration::from_millis(2));
-    }
-}
-
-fn write(writer: &impl RosWriter, payload: &Bytes) {
-    // Writers send no key hash on a topic without keys.
-    let head = SampleHead { key_hash: Some([1; 16]), ..SampleHead::new(SampleKind::Write, 1_000_000_000) };
-    writer.write_ahead(head, payload.clone()).expect("the sample is taken");
-    writer.flush();
-}
-
-fn next<T>(events: &Receiver<T>) -> T {
-    events.recv_timeout(PATIENCE).expect("an event")
-}
-
-fn quiet<T: std::fmt::Debug>(events: &Receiver<T>) {
-    match events.recv_timeout(QUIET) {
-        Err(RecvTimeoutError::Timeout) => {}
-        other => panic!("nothing was to happen: {other:?}"),
-    }
-}
-
-fn discover(network: &impl RosNetwork) -> Receiver<DiscoveryEvent> {
-    let (tx, rx) = channel();
-    let handler = Box::new(move |event| drop(tx.send(event)));
-    network.discover(handler).expect("discovery");
-    rx
 }
 
 /// Returns the next event about endpoints, and skips those about nodes, which some networks report unasked.

@@ -6,10 +6,10 @@ use bytes::Bytes;
 use sgc_ros::{RosNetwork, RosWriter, SampleHead, SampleKind};
 use sgc_wire::{Durability, History};
 
-use super::{
-    PATIENCE, QUIET, Site, appeared, discover, matched, next, quiet, read, received, spec, string_cdr, with,
-    write, writer,
+use super::rig::{
+    PATIENCE, QUIET, discover, matched, next, quiet, read, spec, string_cdr, with, write, writer,
 };
+use super::{Site, appeared, received};
 
 /// A program and a proxy hear each other, in order and with nothing lost.
 pub fn program_and_proxy_exchange_strings_both_ways<S: Site>() {

@@ -11,7 +11,8 @@ use sgc_ros::{
     service_qos,
 };
 
-use super::{PATIENCE, Site, next, quiet};
+use super::Site;
+use super::rig::{PATIENCE, next, quiet};
 
 /// The hash of `example_interfaces/srv/AddTwoInts`.
 const HASH: &str = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a";
@@ -57,6 +58,19 @@ fn ask(client: &impl RosClient, payload: &[u8]) -> RequestId {
     panic!("no server was found");
 }
 
+/// Lets each client call the server: it gets the request with its id, and this client alone the reply.
+fn assert_each_is_answered<C: RosClient>(clients: &[(C, Calls)], server: &impl RosServer, requests: &Calls) {
+    for (n, (client, replies)) in clients.iter().enumerate() {
+        let asked = ask(client, &[0, 1, 0, 0, 1, 2, 3, n as u8]);
+        let (id, payload) = next(requests);
+        assert_eq!((id.client, id.number), (asked.client, asked.number));
+        assert_eq!(payload, [0, 1, 0, 0, 1, 2, 3, n as u8].as_slice());
+        server.reply(&id, Bytes::from_static(ANSWER)).expect("the reply is taken");
+        assert_eq!(next(replies), (asked, Bytes::from_static(ANSWER)));
+    }
+    clients.iter().for_each(|(_, replies)| quiet(replies));
+}
+
 /// Requests of several clients reach the server with their ids, and each reply reaches its client alone.
 pub fn requests_and_replies_find_each_other<S: Site>() {
     let site = S::new();
@@ -64,15 +78,7 @@ pub fn requests_and_replies_find_each_other<S: Site>() {
     for (asker, answerer) in [(&ros, &sgc), (&sgc, &ros)] {
         let (server, requests) = server(answerer);
         let clients = [client(asker), client(asker)];
-        for (n, (client, replies)) in clients.iter().enumerate() {
-            let asked = ask(client, &[0, 1, 0, 0, 1, 2, 3, n as u8]);
-            let (id, payload) = next(&requests);
-            assert_eq!((id.client, id.number), (asked.client, asked.number));
-            assert_eq!(payload, [0, 1, 0, 0, 1, 2, 3, n as u8].as_slice());
-            server.reply(&id, Bytes::from_static(ANSWER)).expect("the reply is taken");
-            assert_eq!(next(replies), (asked, Bytes::from_static(ANSWER)));
-        }
-        clients.iter().for_each(|(_, replies)| quiet(replies));
+        assert_each_is_answered(&clients, &server, &requests);
         assert_eq!(clients[1].0.matched_servers(), 1);
     }
 }
@@ -94,15 +100,7 @@ pub fn programs_behind_one_network_without_tag_call_each_other<S: Site>() {
     let ros = S::new().open(None);
     let (server, requests) = server(&ros);
     let clients = [client(&ros), client(&ros)];
-    for (n, (client, replies)) in clients.iter().enumerate() {
-        let asked = ask(client, &[0, 1, 0, 0, 1, 2, 3, n as u8]);
-        let (id, payload) = next(&requests);
-        assert_eq!((id.client, id.number), (asked.client, asked.number));
-        assert_eq!(payload, [0, 1, 0, 0, 1, 2, 3, n as u8].as_slice());
-        server.reply(&id, Bytes::from_static(ANSWER)).expect("the reply is taken");
-        assert_eq!(next(replies), (asked, Bytes::from_static(ANSWER)));
-    }
-    clients.iter().for_each(|(_, replies)| quiet(replies));
+    assert_each_is_answered(&clients, &server, &requests);
     quiet(&requests);
 }
 
