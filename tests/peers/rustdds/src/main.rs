@@ -1,7 +1,8 @@
 //! A ROS 2 talker and listener on `ros2-client` and RustDDS that does not know SGC.
 //!
-//! `../../README.md` specifies the command line and the printed lines. All events come through one channel: discovery
-//! and data from streams, signals and standard input from threads. Nothing polls.
+//! `../../README.md` specifies the command line and the printed lines. All events come through one channel: data from a
+//! stream, signals and standard input from threads. How many are matched is asked for at an interval, because
+//! `ros2-client` tells its changes through channels of eight places and drops what does not fit.
 
 mod messages;
 mod options;
@@ -31,9 +32,12 @@ const INCOMPLETE: u8 = 3;
 /// Time that a reliable publisher stays for its subscribers, because `ros2-client` does not report acknowledgements.
 const SETTLE: Duration = Duration::from_secs(5);
 
+/// Time between two looks at how many are matched.
+const LOOK: Duration = Duration::from_millis(100);
+
 enum Event {
-    /// Something changed in the graph; how many are matched is asked for.
-    Graph,
+    /// It is time to ask how many are matched.
+    Look,
     /// A line came on standard input, or its end (false).
     Line(bool),
     Received(Result<Reading, String>),
@@ -134,11 +138,10 @@ fn run<M: Message>(options: &Options) -> Result<u8, String> {
         }
     });
     with_node(options, |node| {
-        let changes = node.status_receiver().ok_or("no spinner")?;
-        let change_sender = sender.clone();
+        let look_sender = sender.clone();
         std::thread::spawn(move || {
-            while block_on(changes.recv()).is_ok() {
-                let _ = change_sender.send(Event::Graph);
+            while look_sender.send(Event::Look).is_ok() {
+                std::thread::sleep(LOOK);
             }
         });
         let mut peer = Peer { options, node, events, matched: 0, signalled: false, deadline };

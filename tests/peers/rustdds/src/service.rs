@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::options::{Options, Role};
-use crate::{INCOMPLETE, WRONG, emit, qos, with_node};
+use crate::{INCOMPLETE, LOOK, WRONG, emit, qos, with_node};
 
 /// `example_interfaces/srv/AddTwoInts`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -67,7 +67,7 @@ fn call(
     emit("ready", json!({}));
     let (mut sent, mut answered, mut wrong, mut foreign) = (0, 0, 0, 0);
     let mut latency_us = Vec::new();
-    if within(deadline, client.wait_for_service(node)).is_some() {
+    if found(client, node, deadline) {
         emit("matched", json!({ "count": 1 }));
         std::thread::sleep(SETTLE);
         while sent < options.count {
@@ -132,6 +132,17 @@ fn serve(options: &Options, server: &Server<Request, Response>, deadline: Instan
     std::thread::sleep(SETTLE);
     emit("summary", json!({ "role": "server", "served": served, "unmatched": 0 }));
     Ok(if served >= options.count { 0 } else { INCOMPLETE })
+}
+
+/// Waits for a server, and returns whether there is one. Asks again and again, because a wait hears of changes alone, and
+/// misses those that do not fit into the channel of eight places that it reads.
+fn found(client: &Client<Request, Response>, node: &Node, deadline: Instant) -> bool {
+    while Instant::now() < deadline {
+        if within(deadline.min(Instant::now() + LOOK), client.wait_for_service(node)).is_some() {
+            return true;
+        }
+    }
+    false
 }
 
 /// Returns the output of a future, or `None` after a deadline.
