@@ -17,7 +17,8 @@ struct Taken {
 /// Whether other labs may run at the same time.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) enum TurnKind {
-    /// As many labs as there are processors. A test may wait for events, and must not measure time or loss.
+    /// Twice as many labs as there are processors, since two thirds of a lab's time is waiting. A test may wait for events,
+    /// and must not measure time or loss.
     Shared,
     /// No other lab.
     Exclusive,
@@ -30,9 +31,9 @@ pub(crate) struct Turn(TurnKind);
 impl Turn {
     /// Waits for a turn. One that waits for an exclusive turn lets shared ones pass, so that these overlap for longer.
     pub(crate) fn take(kind: TurnKind) -> Self {
-        let processors = available_parallelism().map_or(1, usize::from);
+        let shared_max = 2 * available_parallelism().map_or(1, usize::from);
         let must_wait = |taken: &mut Taken| match kind {
-            TurnKind::Shared => taken.exclusive > 0 || taken.shared >= processors,
+            TurnKind::Shared => taken.exclusive > 0 || taken.shared >= shared_max,
             TurnKind::Exclusive => taken.exclusive > 0 || taken.shared > 0,
         };
         let mut taken = ENDED.wait_while(lock(&TAKEN), must_wait).unwrap();
