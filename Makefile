@@ -4,11 +4,11 @@
 CARGO ?= cargo
 ARGS ?=
 # The features of release builds. Tests use them too, so that Cyclone DDS is built once.
-FEATURES := --features sgc/sros2
+FEATURES := --features sgc/sros2,sgc/zenoh
 # Suites of tests with programs of others (`test = false` in their Cargo.toml): those with labs, and the rest. A suite may have
 # other tests, too; then those with programs of others are ignored. A name stands for the suites of all crates, so no suite of
 # `unit` may have one of these names: it would run twice.
-LABS := $(addprefix --test ,fidelity gateway peers ros2)
+LABS := $(addprefix --test ,fidelity gateway peers ros2 zenoh)
 INTEROP := $(addprefix --test ,browser dashboard gateway_soak looking mended redis ring ros_graph soak transports vendors)
 CLIENTS := $(addprefix --test ,foxglove grpc otlp rosbridge)
 
@@ -16,7 +16,7 @@ CLIENTS := $(addprefix --test ,foxglove grpc otlp rosbridge)
 COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \
 	SGC_COMMIT_DATE=$${SGC_COMMIT_DATE-$$(git log -1 --format=%cs 2>/dev/null)}
 
-.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-direct bench-instructions bench-store bench-look-up scale bench-link-state clean-tools deps-bench bench-peers
+.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers peers-hiroz vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn zenoh-long stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-direct bench-zenoh bench-instructions bench-store bench-look-up scale bench-link-state clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--duration 10s --json")'
@@ -30,9 +30,11 @@ help:
 	@echo '                 upgrade-test (this version together with an earlier one, SGC_OLD; root)'
 	@echo '                 image, image-test (the image of a container, with podman; root)'
 	@echo '                 book (the documents as a book, target/book/index.html; builds mdbook once)'
+	@echo '                 peers-hiroz (a further peer of Zenoh networks for peers-check; minutes, the first time)'
 	@echo '                 peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
 	@echo '                 ring (two minutes of faults, without and with a store; SGC_RING_SEED, SGC_RING_SECONDS; SGC_RING_DIR keeps the logs)'
 	@echo '                 churn (200 random restarts; SGC_CHURN_SEED, SGC_CHURN_STEPS)'
+	@echo '                 zenoh-long (100 restarts on networks of rmw_zenoh, and 10000 topics; SGC_ZENOH_RESTARTS, SGC_ZENOH_TOKENS)'
 	@echo '                 stall (ten minutes of images to a stalled subscriber; SGC_STALL_SECONDS)'
 	@echo '                 soak (20 nodes for two hours; SGC_SOAK_SECONDS, SGC_SOAK_SEED; SGC_SOAK_DIR keeps logs and samples; root)'
 	@echo '                 gateway-soak (500 clients of the gateway, and 20000 short connections; SGC_SOAK_CLIENTS, SGC_SOAK_CONNECTS)'
@@ -48,6 +50,7 @@ help:
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
 	@echo '                 bench-gateway (gRPC and the rosbridge protocol)'
 	@echo '                 bench-direct (direct paths between two NATs, beside WireGuard and iroh; root, half an hour)'
+	@echo '                 bench-zenoh (programs of rmw_zenoh, natively and through SGC; root, eight minutes; ARGS="--quick")'
 	@echo '                 bench-store (names in a cluster of redis-server; root, a minute; ARGS="--names 10000000")'
 	@echo '                 bench-look-up (the first look-up of a name by flood, query and store; root)'
 	@echo '                 bench-link-state (one router among up to 10 000)'
@@ -118,6 +121,10 @@ deps-dist:
 peers:
 	@scripts/build-peers.sh
 
+# Builds a further Zenoh peer, which `peers-check` uses if it is there. Minutes, the first time.
+peers-hiroz:
+	@scripts/build-hiroz.sh
+
 # Checks the golden vectors of names, identities, both kinds of tokens, sealing and grants, and CDR with independent implementations.
 vectors: peers
 	.venv/bin/python -B scripts/check-vectors.py
@@ -143,7 +150,7 @@ unit:
 # (`tests/support/turn.rs`), so most of their threads wait.
 interop: peers
 	$(CARGO) test --workspace $(CLIENTS) $(FEATURES) --locked -- --ignored
-	RUST_TEST_THREADS=6 $(CARGO) test --workspace $(LABS) $(FEATURES) --locked $(ARGS)
+	RUST_TEST_THREADS=8 $(CARGO) test --workspace $(LABS) $(FEATURES) --locked $(ARGS)
 	$(CARGO) test --workspace $(INTEROP) $(FEATURES) --locked $(ARGS)
 
 # The oldest Rust that Cargo.toml supports. rustup must have it.
@@ -177,15 +184,22 @@ advisories:
 # Tests the peers against each other, without sgc between them.
 peers-check: peers
 	.venv/bin/python -B tests/peers/check.py
+	.venv/bin/python -B tests/peers/check_zenoh.py
 
 peers-check-long: peers
 	.venv/bin/python -B tests/peers/check.py --long
+	.venv/bin/python -B tests/peers/check_zenoh.py --long
 
 # Cuts the links of five routers and kills routers at random, and then, with a store of names, also servers of the store. Prints
 # its seed, a new one each time. The suite runs a short one. With the store alone: ARGS=with_a_store.
 ring: peers
 	SGC_RING_SEED=$${SGC_RING_SEED:-$$(date +%s)} SGC_RING_SECONDS=$${SGC_RING_SECONDS:-120} \
 		$(CARGO) test -p sgc $(FEATURES) --locked --test ring $(ARGS) -- --nocapture
+
+# Restarts programs of rmw_zenoh a hundred times, and floods a network of theirs with ten thousand topics. The suite runs a short one.
+zenoh-long: peers
+	SGC_ZENOH_RESTARTS=$${SGC_ZENOH_RESTARTS:-100} SGC_ZENOH_TOKENS=$${SGC_ZENOH_TOKENS:-10000} \
+		$(CARGO) test -p sgc $(FEATURES) --locked --test zenoh $(ARGS) -- leave_neither hostile --nocapture
 
 # Restarts programs and nodes two hundred times at random. Prints its seed, a new one each time. The suite runs a short one.
 churn: peers
@@ -230,15 +244,24 @@ vendors: peers
 model-check:
 	CARGO_PROFILE_DEV_OPT_LEVEL=3 $(CARGO) test --locked -p sgc-testkit --test tree_protocol -- --ignored --nocapture
 
+# The benchmarks without Zenoh, and the load generator on DDS.
+BENCH_BUILD = $(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench -p sgc-bench-load \
+	--no-default-features --features sgc-bench-load/dds
+# The load generator as programs of rmw_zenoh.
+ZENOH_LOAD = $(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench-load --no-default-features \
+	--features zenoh --target-dir bench/target/zenoh
+
 # Measures SGC and its alternatives side by side; root. The alternatives are built first, each where `compare` looks for it:
-# ROS 2, the load generator with DDS Security, and the Zenoh bridge as its own project builds it, which takes long.
+# ROS 2, the load generator with DDS Security and with Zenoh, and the Zenoh bridge as its own project builds it, which takes
+# long.
 bench: build
 	@scripts/install-deps.sh bench
 	@scripts/build-ros2.sh
 	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench-load --features dds-security \
 		--target-dir bench/target/dds-security
 	$(CARGO) build --release --locked --manifest-path bench/zenoh-bridge/Cargo.toml --target-dir bench/zenoh-bridge/target
-	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -p sgc-bench-load
+	$(ZENOH_LOAD)
+	$(BENCH_BUILD)
 	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- compare \
 		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
@@ -256,7 +279,7 @@ bench-transports: deps-build
 
 # Needs neither root nor zenoh. ARGS="--quick", ARGS="--ways rosbridge-json,grpc-cdr".
 bench-gateway: build
-	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -p sgc-bench-load
+	$(BENCH_BUILD)
 	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- gateway \
 		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
@@ -264,16 +287,26 @@ bench-gateway: build
 bench-direct: build
 	@scripts/install-deps.sh bench
 	$(CARGO) build --release --locked --manifest-path bench/iroh-peer/Cargo.toml --target-dir bench/iroh-peer/target
-	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -p sgc-bench-load
+	$(BENCH_BUILD)
 	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- direct \
 		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
-# Builds the peers of `compare`: the Zenoh bridge (minutes, the first time), the load generator with DDS Security, and ROS 2.
+# Runs the tables of `compare` that have programs of rmw_zenoh. The report is in target/bench-zenoh, because bench/results has
+# that of the whole comparison. ARGS="--quick", ARGS="--systems sgc-zenoh-zenoh".
+bench-zenoh: build
+	$(ZENOH_LOAD)
+	$(BENCH_BUILD)
+	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- compare \
+		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" --only rmw-zenoh,rmw-zenoh-idle --out target/bench-zenoh $(ARGS)
+
+# Builds the peers of `compare`: the Zenoh bridge (minutes, the first time), the load generator with DDS Security and with
+# Zenoh, and ROS 2.
 bench-peers: deps-bench
 	@scripts/build-ros2.sh
 	$(CARGO) build --release --locked --manifest-path bench/zenoh-bridge/Cargo.toml --target-dir bench/zenoh-bridge/target
 	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench-load --features dds-security \
 		--target-dir bench/target/dds-security
+	$(ZENOH_LOAD)
 
 # Compares with bench/instructions.json and fails if a count grew. ARGS=--accept writes the current counts there; ARGS=seal
 # counts only the cases with "seal" in their names.

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds the independent test peers .peers/cyclone (Python), .peers/fastdds (C++) and .peers/rustdds (Rust).
+# Builds the independent test peers .peers/cyclone and .peers/zenoh (Python), .peers/fastdds (C++) and .peers/rustdds (Rust).
 # Installs ROS 2 (build-ros2.sh), Prometheus (get-prometheus.sh), and the Python and JavaScript libraries that clients of the
 # gateway use.
 # Skips each part that is newer than its sources.
@@ -49,6 +49,13 @@ here=$(cd "$(dirname "$0")/.." && pwd)
 exec "$here/.venv/bin/python" -B "$here/tests/peers/py/peer.py" "$@"
 SCRIPT
 chmod +x .peers/cyclone
+
+cat >.peers/zenoh <<'SCRIPT'
+#!/bin/sh
+here=$(cd "$(dirname "$0")/.." && pwd)
+exec "$here/.venv/bin/python" -B "$here/tests/peers/zenoh/peer.py" "$@"
+SCRIPT
+chmod +x .peers/zenoh
 
 source=tests/peers/fastdds/peer.cpp
 if [ ! -x .peers/fastdds ] || [ -n "$(find tests/peers/fastdds -newer .peers/fastdds -type f)" ]; then

@@ -15,7 +15,7 @@ advisories) "$tool" --locked check advisories ;;
     # Duplicates are warnings. `cargo tree -d` shows their trees, which are long.
     "$tool" --locked check --hide-inclusion-graph bans licenses sources
     # Nothing that CI builds reads these.
-    for workspace in bench bench/iroh-peer bench/zenoh-bridge fuzz; do
+    for workspace in bench bench/iroh-peer bench/zenoh-bridge fuzz tests/peers/hiroz; do
         cargo update --quiet --workspace --locked --manifest-path "$workspace/Cargo.toml" ||
             die "$workspace/Cargo.lock is out of date: cargo update --workspace --manifest-path $workspace/Cargo.toml"
     done

@@ -34,7 +34,7 @@ done
 TOOL_OPT_LEVEL=2 cargo_tool cargo-about 0.9.3 --no-default-features --features cli
 # Licences are read from the sources of all crates, those for other systems included.
 cargo fetch --locked
-"$tool" --color never generate --offline --fail --locked --manifest-path crates/sgc/Cargo.toml --features sros2 \
+"$tool" --color never generate --offline --fail --locked --manifest-path crates/sgc/Cargo.toml --features sros2,zenoh \
     --config dist/about.toml --output-file "$stage/share/doc/licences.txt" dist/about.hbs
 cp NOTICE LICENSE README.md CHANGELOG.md "$stage/share/doc"
 cp -r dist/examples "$stage/share/doc"
@@ -47,7 +47,7 @@ cp dist/systemd/tmpfiles.conf "$stage/lib/tmpfiles.d/sgc.conf"
 
 cargo_tool cargo-cyclonedx 0.5.9
 # It writes beside each manifest of the workspace; that of the program has them all.
-"$tool" cyclonedx --quiet --manifest-path crates/sgc/Cargo.toml --features sros2 --target "$target" --format json --spec-version 1.5 --no-build-deps \
+"$tool" cyclonedx --quiet --manifest-path crates/sgc/Cargo.toml --features sros2,zenoh --target "$target" --format json --spec-version 1.5 --no-build-deps \
     --override-filename sgc.cdx
 # Paths of the machine that built it say nothing to others.
 sed "s,$root,.,g" crates/sgc/sgc.cdx.json >"$out/$name.cdx.json"

@@ -8,11 +8,12 @@ cargo=${CARGO:-cargo}
 # The crates that only this feature needs.
 declare -A crates=(
     [dtls]="dimpl"
-    [grpc]="tonic prost h2"
-    [otlp]="sgc-otlp prost rustls-native-certs"
+    [grpc]="tonic prost"
+    [otlp]="sgc-otlp prost"
+    [zenoh]="sgc-zenoh-network zenoh zenoh-ext"
 )
 
-for feature in "" dtls foxglove grpc otlp rosbridge; do
+for feature in "" dtls foxglove grpc otlp rosbridge zenoh; do
     echo "features: ${feature:-none}"
     $cargo clippy -p sgc --no-default-features --features "$feature" --locked "$@" -- -D warnings
     tree=$($cargo tree -p sgc -e normal --no-default-features --features "$feature" --locked --prefix none --format '{p}' "$@")

@@ -32,7 +32,7 @@ if [ "${1:-}" != inside ]; then
         fi
         old=$program
     fi
-    cargo build --locked -p sgc --features sgc/sros2
+    cargo build --locked -p sgc --features sgc/sros2,sgc/zenoh
     exec unshare --net --mount --kill-child --fork env SGC_OLD="$old" "$root/scripts/upgrade-test.sh" inside
 fi
 

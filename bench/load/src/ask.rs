@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 
 use crate::caller::Caller;
-use crate::dds::Message;
+use crate::network::Message;
 use crate::node::{LONG, Node};
 use crate::ping::HEAD_BYTES;
 use crate::report::{Event, Next, Order, say};

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 
-use crate::dds::Message;
+use crate::network::Message;
 use crate::node::Node;
 use crate::report::{Event, Next, say};
 use crate::{Common, now_ns};

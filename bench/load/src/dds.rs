@@ -83,17 +83,19 @@ pub(crate) struct Message<'a> {
 pub(crate) struct Network {
     participant: Entity,
     guid: [u8; 16],
+    /// The name of its node.
+    node: CString,
     /// The type of its measured messages.
     messages: &'static types::Descriptor,
 }
 
 impl Network {
     /// Joins a domain, with the configuration that `CYCLONEDDS_URI` says.
-    pub(crate) fn join(domain: u32) -> Result<Self> {
-        Self::join_with(domain, &types::MESSAGE)
+    pub(crate) fn join(domain: u32, node: &str) -> Result<Self> {
+        Ok(Self { node: CString::new(node)?, ..Self::join_with(domain, &types::MESSAGE)? })
     }
 
-    /// Joins a domain whose measured messages have this type.
+    /// Joins a domain without a node. Its measured messages have this type.
     pub(crate) fn join_with(domain: u32, messages: &'static types::Descriptor) -> Result<Self> {
         let qos = Qos::new()?;
         // As every participant of ROS 2 has it.
@@ -105,12 +107,7 @@ impl Network {
         };
         let participant = Entity::new(handle).with_context(|| format!("domain {domain}"))?;
         let guid = participant.guid()?;
-        Ok(Self { participant, guid, messages })
-    }
-
-    /// The GUID of the participant.
-    pub(crate) fn guid(&self) -> [u8; 16] {
-        self.guid
+        Ok(Self { participant, guid, node: CString::default(), messages })
     }
 
     fn topic(&self, descriptor: &types::Descriptor, name: &str) -> Result<Entity> {
@@ -181,12 +178,6 @@ impl Writer {
         Self::open(network, network.messages, &types::dds_name(name), qos)
     }
 
-    /// Opens the writer of the ROS graph, which every node has.
-    pub(crate) fn for_graph(network: &Network) -> Result<Self> {
-        let quality = Quality { reliable: true, depth: 1 };
-        Self::open(network, &types::GRAPH, "ros_discovery_info", Qos::from_quality(quality, true)?)
-    }
-
     fn open(network: &Network, descriptor: &types::Descriptor, dds_name: &str, qos: Qos) -> Result<Self> {
         let topic = network.topic(descriptor, dds_name)?;
         // SAFETY: Cyclone checks the handles; the QoS outlives the call.
@@ -196,11 +187,6 @@ impl Writer {
         // SAFETY: takes numbers.
         check(unsafe { dds_set_status_mask(entity.0, mask) })?;
         Ok(Self { entity, _topic: topic })
-    }
-
-    /// Returns the GUID.
-    pub(crate) fn guid(&self) -> Result<[u8; 16]> {
-        self.entity.guid()
     }
 
     /// Returns the number of matched readers.
@@ -226,27 +212,6 @@ impl Writer {
         check(unsafe { dds_write_flush(self.entity.0) })
     }
 
-    /// Announces the node to which the endpoints of this participant belong. Needs a writer of [`Self::for_graph`].
-    pub(crate) fn announce(
-        &self,
-        network: &Network,
-        node: &CStr,
-        readers: &[[u8; 16]],
-        writers: &[[u8; 16]],
-    ) -> Result<()> {
-        let entities = types::NodeEntities {
-            namespace: c"/".as_ptr(),
-            name: node.as_ptr(),
-            readers: types::sequence(readers),
-            writers: types::sequence(writers),
-        };
-        let entities = [entities];
-        let info = types::ParticipantEntities { gid: network.guid(), nodes: types::sequence(&entities) };
-        // SAFETY: as in `write`; strings and sequences live through the call.
-        self.write_raw(unsafe { dds_write(self.entity.0, (&raw const info).cast()) })?;
-        Ok(())
-    }
-
     fn write_raw(&self, code: dds_return_t) -> Result<bool> {
         if code == DDS_RETCODE_TIMEOUT {
             return Ok(false);
@@ -259,6 +224,40 @@ impl Writer {
     pub(crate) fn until_acknowledged(&self, timeout: Duration) -> Result<bool> {
         // SAFETY: takes numbers.
         self.write_raw(unsafe { dds_wait_for_acks(self.entity.0, nanoseconds(timeout)) })
+    }
+}
+
+/// The announcement of a node in `ros_discovery_info`.
+#[derive(Debug)]
+pub(crate) struct Graph(Writer);
+
+impl Graph {
+    /// Opens the writer, which every node has.
+    pub(crate) fn open(network: &Network) -> Result<Self> {
+        let qos = Qos::from_quality(Quality { reliable: true, depth: 1 }, true)?;
+        Ok(Self(Writer::open(network, &types::GRAPH, "ros_discovery_info", qos)?))
+    }
+
+    /// Announces the node to which the endpoints of this participant belong.
+    pub(crate) fn announce(
+        &mut self,
+        network: &Network,
+        readers: &[Reader],
+        writers: &[Writer],
+    ) -> Result<()> {
+        let readers = readers.iter().map(|reader| reader.entity.guid()).collect::<Result<Vec<_>>>()?;
+        let writers = writers.iter().map(|writer| writer.entity.guid()).collect::<Result<Vec<_>>>()?;
+        let entities = types::NodeEntities {
+            namespace: c"/".as_ptr(),
+            name: network.node.as_ptr(),
+            readers: types::sequence(&readers),
+            writers: types::sequence(&writers),
+        };
+        let entities = [entities];
+        let info = types::ParticipantEntities { gid: network.guid, nodes: types::sequence(&entities) };
+        // SAFETY: as in `Writer::write`; strings and sequences live through the call.
+        self.0.write_raw(unsafe { dds_write(self.0.entity.0, (&raw const info).cast()) })?;
+        Ok(())
     }
 }
 
@@ -319,11 +318,6 @@ impl Reader {
             dds_delete_listener(listener);
             reader
         }
-    }
-
-    /// Returns the GUID.
-    pub(crate) fn guid(&self) -> Result<[u8; 16]> {
-        self.entity.guid()
     }
 
     /// Returns the number of matched writers.

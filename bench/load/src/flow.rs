@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail, ensure};
 use clap::Args;
 
-use crate::dds::Message;
+use crate::network::Message;
 use crate::node::{HELLO_EVERY, LONG, Node};
 use crate::ping::HEAD_BYTES;
 use crate::report::{Event, Next, Order, say};

@@ -1,5 +1,5 @@
 //! `load`: talkers and listeners for benchmarks. They are plain Cyclone DDS programs with a ROS 2 node's names, and do
-//! not know what carries their topics.
+//! not know what carries their topics. With the feature `zenoh`, the same roles are programs of rmw_zenoh.
 //!
 //! This file knows the command line. Each role prints events on standard output in lines of JSON ([`report::Event`]),
 //! takes orders from standard input ([`report::Order`]), and ends when that does. It measures and judges nothing.
@@ -7,22 +7,34 @@
 
 mod ask;
 mod caller;
+#[cfg(not(feature = "zenoh"))]
 #[allow(unsafe_code)]
 mod dds;
 mod flow;
 mod forwarder;
 mod node;
 mod ping;
+#[cfg(not(feature = "zenoh"))]
 mod relay;
 mod report;
+#[cfg(feature = "zenoh")]
+mod rmw_zenoh;
+#[cfg(not(feature = "zenoh"))]
 mod types;
 
 use anyhow::Result;
 use clap::{Args, Parser, Subcommand};
 
-use dds::Quality;
+/// The middleware of the roles.
+#[cfg(not(feature = "zenoh"))]
+use dds as network;
+#[cfg(feature = "zenoh")]
+use rmw_zenoh as network;
 
-/// Talkers and listeners for benchmarks, on Cyclone DDS. `CYCLONEDDS_URI` configures Cyclone.
+use network::Quality;
+
+/// Talkers and listeners for benchmarks, on Cyclone DDS, which `CYCLONEDDS_URI` configures, or on Zenoh
+/// (`ZENOH_CONFIG_OVERRIDE`).
 #[derive(Parser)]
 struct Cli {
     #[command(subcommand)]
@@ -44,9 +56,13 @@ enum Role {
     /// Counts messages and their ages
     Sink(flow::SinkArgs),
     /// Carries topics to another relay over TCP, as they are
+    #[cfg(not(feature = "zenoh"))]
     Relay(relay::RelayArgs),
     /// Forwards the bytes of a TCP connection
     Forwarder(forwarder::ForwarderArgs),
+    /// A Zenoh router with the settings of rmw_zenohd
+    #[cfg(feature = "zenoh")]
+    Router,
 }
 
 /// The arguments of every role.
@@ -83,8 +99,11 @@ fn main() -> Result<()> {
         Role::Answer(args) => ask::answer(&args),
         Role::Source(args) => flow::source(&args),
         Role::Sink(args) => flow::sink(&args),
+        #[cfg(not(feature = "zenoh"))]
         Role::Relay(args) => relay::relay(&args),
         Role::Forwarder(args) => forwarder::forward(&args),
+        #[cfg(feature = "zenoh")]
+        Role::Router => rmw_zenoh::route(|| report::say(&report::Event::Up)),
     }
 }
 

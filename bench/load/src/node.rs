@@ -1,11 +1,10 @@
-//! A ROS 2 node: a participant that announces its readers and writers in `ros_discovery_info`.
+//! A ROS 2 node: a program on the network that announces its readers and writers.
 
-use std::ffi::CString;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
-use crate::dds::{Message, Network, Reader, Waiter, Writer};
+use crate::network::{Graph, Message, Network, Reader, Waiter, Writer};
 use crate::report::{Event, Orders, say};
 use crate::{Common, now_ns};
 
@@ -20,7 +19,7 @@ pub(crate) struct Node {
     pub(crate) writers: Vec<Writer>,
     pub(crate) waiter: Waiter,
     pub(crate) orders: Orders,
-    _graph: Writer,
+    _graph: Graph,
     _network: Network,
 }
 
@@ -31,8 +30,8 @@ impl Node {
         read: impl IntoIterator<Item = String>,
         write: impl IntoIterator<Item = String>,
     ) -> Result<Self> {
-        let network = Network::join(common.domain)?;
-        let graph = Writer::for_graph(&network)?;
+        let network = Network::join(common.domain, &common.node)?;
+        let mut graph = Graph::open(&network)?;
         let quality = common.quality();
         let mut waiter = Waiter::new(&network)?;
         let mut readers = Vec::new();
@@ -47,9 +46,7 @@ impl Node {
             waiter.attach_writer(&writer)?;
             writers.push(writer);
         }
-        let reader_ids = readers.iter().map(Reader::guid).collect::<Result<Vec<_>>>()?;
-        let writer_ids = writers.iter().map(Writer::guid).collect::<Result<Vec<_>>>()?;
-        graph.announce(&network, &CString::new(&*common.node)?, &reader_ids, &writer_ids)?;
+        graph.announce(&network, &readers, &writers)?;
         let orders = Orders::listen(waiter.bell());
         say(&Event::Up)?;
         Ok(Self { readers, writers, waiter, orders, _graph: graph, _network: network })

@@ -8,7 +8,7 @@ use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 
-use crate::dds::Bell;
+use crate::network::Bell;
 
 /// An order to a role.
 #[derive(Clone, Debug, Deserialize)]

@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 /// One number.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Figure {
-    /// The table that it belongs to: `round-trip`, `throughput`, `real-ros2` and those that begin so, `start-up`,
-    /// `applications`, `fleet-step`, `fan-out`, `multi-hop`, `teleop`, `roaming`, `footprint`.
+    /// The table that it belongs to: `round-trip`, `throughput`, `real-ros2`, `rmw-zenoh` and those that begin so,
+    /// `start-up`, `applications`, `fleet-step`, `fan-out`, `multi-hop`, `teleop`, `roaming`, `footprint`.
     pub(crate) table: String,
     /// The measured system: `direct`, `wireguard`, `dds-security`, `zenoh-tcp`, `zenoh-tls`, `sgc-quic-group`,
     /// `sgc-dtls-standard`, …; `sgc-quic-group-router` with a router process between the proxies; `ssh`; `tcp`.

@@ -38,9 +38,9 @@ const TOPIC: &str = "/footprint/t";
 /// ROS domains of the two ends.
 const DOMAINS: [u32; 2] = [41, 42];
 /// How long a process at rest is watched: one with nothing to do, and one that has more to keep.
-const IDLE: Duration = Duration::from_secs(20);
+pub(crate) const IDLE: Duration = Duration::from_secs(20);
 const IDLE_WITH_MORE: Duration = Duration::from_secs(5);
-const IDLE_QUICK: Duration = Duration::from_secs(2);
+pub(crate) const IDLE_QUICK: Duration = Duration::from_secs(2);
 /// A process is at rest when it took less of a core than this for so long, or after as long as that takes at most.
 const REST_PART: f64 = 0.02;
 const REST_LOOK: Duration = Duration::from_secs(1);
@@ -243,13 +243,13 @@ impl Stage {
     fn measure(&self, system: &str, path: &str, at: usize, pid: u32, figures: &mut Figures) -> Result<f64> {
         // A router without names has been watched when it had no links.
         let idle = if at == 0 && path != "names" { IDLE } else { IDLE_WITH_MORE };
-        measure((system, path, at), pid, if self.is_quick { IDLE_QUICK } else { idle }, figures)
+        measure((TABLE, system, path, at), pid, if self.is_quick { IDLE_QUICK } else { idle }, figures)
     }
 }
 
-/// Pushes what a process costs at rest under this system, path and count; its resident memory, bytes.
+/// Pushes what a process costs at rest under this table, system, path and count; its resident memory, bytes.
 fn measure(
-    (system, path, at): (&str, &str, usize),
+    (table, system, path, at): (&str, &str, &str, usize),
     pid: u32,
     idle: Duration,
     figures: &mut Figures,
@@ -257,7 +257,7 @@ fn measure(
     let begun = Instant::now();
     while part_taken(pid, REST_LOOK) > REST_PART {
         if begun.elapsed() > REST_MAX {
-            figures.leave_out(&format!("footprint, {system}, {at} {path}"), "it does not come to rest");
+            figures.leave_out(&format!("{table}, {system}, {at} {path}"), "it does not come to rest");
             break;
         }
     }
@@ -265,7 +265,7 @@ fn measure(
     let rss = resident_bytes_of(pid).0 as f64;
     let anonymous = status_field_of(pid, "RssAnon")? as f64 * 1024.0;
     let threads = status_field_of(pid, "Threads")? as f64;
-    let mut push = |metric, value| figures.push(TABLE, system, path, at as f64, metric, value);
+    let mut push = |metric, value| figures.push(table, system, path, at as f64, metric, value);
     push("rss_bytes", rss);
     push("anonymous_bytes", anonymous);
     push("threads", threads);
@@ -325,7 +325,7 @@ fn bridges(compare: &Compare, idle: Duration, figures: &mut Figures) {
     let systems = compare.systems().iter().filter(|system| system.name().starts_with("zenoh"));
     let measured = abreast(systems, |system| {
         let (name, mut figures) = (system.name(), Figures::default());
-        if let Err(error) = bridge(compare, &**system, idle, &mut figures) {
+        if let Err(error) = without_topics(compare, TABLE, &**system, idle, &mut figures) {
             figures.leave_out(&format!("footprint, {name}"), format!("{error:#}"));
         }
         figures
@@ -333,16 +333,23 @@ fn bridges(compare: &Compare, idle: Duration, figures: &mut Figures) {
     measured.into_iter().for_each(|its| figures.append(its));
 }
 
-fn bridge(compare: &Compare, system: &dyn System, idle: Duration, figures: &mut Figures) -> Result<()> {
+/// Measures the process of a system that was started last, without topics.
+pub(crate) fn without_topics(
+    compare: &Compare,
+    table: &str,
+    system: &dyn System,
+    idle: Duration,
+    figures: &mut Figures,
+) -> Result<()> {
     let lab = Lab::new(PathKind::Bare, compare.load())?;
     let running = system.start(&lab, &[])?;
-    let (_, process) = running.processes.last().context("a bridge without a process")?;
-    measure((&system.name(), "topics", 0), process.pid(), idle, figures)?;
+    let (_, process) = running.processes.last().context("a system without a process")?;
+    measure((table, &system.name(), "topics", 0), process.pid(), idle, figures)?;
     Ok(())
 }
 
 /// Size of a program without what only debuggers read, bytes.
-fn stripped_bytes(program: &Path) -> Result<u64> {
+pub(crate) fn stripped_bytes(program: &Path) -> Result<u64> {
     let dir = tempfile::tempdir()?;
     let stripped = dir.path().join("program");
     let status =

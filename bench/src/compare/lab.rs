@@ -145,6 +145,7 @@ impl Lab {
 
     /// Starts a load program in any local network of a place.
     pub(crate) fn load_in(&self, dds: &Dds, side: Side, args: &[&str]) -> Result<Program> {
+        let side = dds.place.unwrap_or(side);
         let mut command = self.command(side, dds.load.as_deref().unwrap_or(&self.load));
         command.args(args).args(["--domain", &dds.domain.to_string()]);
         dds.configure(&mut command);

@@ -19,6 +19,7 @@ mod plot;
 mod program;
 mod real_ros2;
 mod report;
+mod rmw_zenoh;
 mod roaming;
 mod round_trip;
 mod sample;
@@ -51,10 +52,12 @@ pub(crate) use system::{Dds, wireguard};
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
 
 /// Every table, in the order of the report.
-const TABLES: [(&str, Table); 11] = [
+const TABLES: [(&str, Table); 13] = [
     ("round-trip", round_trip::run),
     ("throughput", throughput::run),
     (real_ros2::TABLE, real_ros2::run),
+    (rmw_zenoh::TABLE, rmw_zenoh::run),
+    (rmw_zenoh::IDLE, rmw_zenoh::run_idle),
     ("start-up", start_up::run),
     ("applications", applications::run),
     ("fleet-step", fleet_step::run),
@@ -119,7 +122,7 @@ impl Compare {
         let mut systems = system::all(&args.sgc, &args.peers)?;
         let mut relays = system::relays();
         let mut names: Vec<_> = systems.iter().chain(&relays).map(|system| system.name()).collect();
-        names.extend(system::CONFIGURED.map(str::to_owned));
+        names.extend(system::CONFIGURED.into_iter().chain(system::WITH_RMW_ZENOH).map(str::to_owned));
         names.extend([tcp::NAME, real_ros2::ONE_HOST].map(str::to_owned));
         for pattern in &args.systems {
             ensure!(
@@ -185,6 +188,16 @@ impl Compare {
         zenoh: serde_json::Value,
     ) -> Result<Vec<Box<dyn System>>> {
         let mut systems = system::configured(&self.args.sgc, &self.args.peers, priorities, zenoh)?;
+        systems.retain(|system| self.wants(&system.name()));
+        Ok(systems)
+    }
+
+    /// Returns the systems with programs of rmw_zenoh; see [`system::with_rmw_zenoh`].
+    pub(crate) fn with_rmw_zenoh(
+        &self,
+        priorities: &'static [(&'static str, &'static str)],
+    ) -> Result<Vec<Box<dyn System>>> {
+        let mut systems = system::with_rmw_zenoh(&self.args.sgc, &self.args.peers, priorities)?;
         systems.retain(|system| self.wants(&system.name()));
         Ok(systems)
     }

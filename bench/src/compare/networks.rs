@@ -1,10 +1,13 @@
-//! The DDS networks of the two places, and a started system that connects them.
+//! The ROS networks of the two places, of DDS or of rmw_zenoh, and a started system that connects them.
 
 use std::net::IpAddr;
 use std::path::PathBuf;
 use std::process::Command;
 
 use super::program::Program;
+
+/// The variable with settings of Zenoh, as rmw_zenoh reads it.
+pub(crate) const ZENOH_OVERRIDES: &str = "ZENOH_CONFIG_OVERRIDE";
 
 /// One of the two places.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -42,6 +45,10 @@ pub(crate) struct Dds {
     pub(crate) uri: Option<String>,
     /// Another build of the program that talks and listens, if it takes one.
     pub(crate) load: Option<PathBuf>,
+    /// For `ZENOH_CONFIG_OVERRIDE`, where the programs are those of rmw_zenoh.
+    pub(crate) zenoh: Option<String>,
+    /// The place of all programs, if it is one for both sides.
+    pub(crate) place: Option<Side>,
 }
 
 impl Dds {
@@ -66,19 +73,28 @@ impl Dds {
              <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers>{peers}</Peers></Discovery>\
              </Domain></CycloneDDS>"
         );
-        Self { domain: 0, uri: Some(uri), load: None }
+        Self { uri: Some(uri), ..Self::stock(0) }
     }
 
     /// A network on every interface with multicast, as ROS 2 has it by default.
     pub(crate) fn stock(domain: u32) -> Self {
-        Self { domain, uri: None, load: None }
+        Self { domain, uri: None, load: None, zenoh: None, place: None }
     }
 
-    /// Gives a program of Cyclone DDS its configuration, and no other.
+    /// A network of rmw_zenoh with the router of a place, for this build of the load program.
+    pub(crate) fn zenoh(load: PathBuf) -> Self {
+        Self { load: Some(load), ..Self::stock(0) }
+    }
+
+    /// Gives a program its configuration, and no other.
     pub(crate) fn configure(&self, command: &mut Command) {
         match &self.uri {
             Some(uri) => command.env("CYCLONEDDS_URI", uri),
             None => command.env_remove("CYCLONEDDS_URI"),
+        };
+        match &self.zenoh {
+            Some(overrides) => command.env(ZENOH_OVERRIDES, overrides),
+            None => command.env_remove(ZENOH_OVERRIDES),
         };
     }
 }

@@ -14,7 +14,9 @@ use super::figures::{Figure, Figures};
 use super::goals;
 use super::plot::{self, Axis, Bar, Hue, Series, Stroke, Unit, join, three_digits};
 use super::real_ros2;
+use super::rmw_zenoh;
 use super::round_trip::GAVE_UP;
+use super::system::WITH_RMW_ZENOH;
 use crate::report::Machine;
 
 /// The results of a run.
@@ -183,6 +185,37 @@ impl<'a> About<'a> {
                 Unit::Plain,
                 Plot::Nothing,
             ),
+            rmw_zenoh::TABLE => (
+                "rmw_zenoh",
+                "Programs of rmw_zenoh, or of DDS where it says so, at the two places: 1000 B, reliable, `KEEP_ALL`, as fast as they are \
+                 taken. CPU and memory are those of Zenoh routers and `sgc`. SGC has a router of its own between the two proxies, suite `pairwise`.\n",
+                "bytes of a message",
+                Unit::Bytes,
+                Plot::Nothing,
+            ),
+            rmw_zenoh::ROUND_TRIP => (
+                "rmw_zenoh, round trip",
+                "One message there and the same back, one at a time, between the same programs; reliable, depth 10.\n",
+                "bytes of a message",
+                Unit::Bytes,
+                Plot::Curves,
+            ),
+            rmw_zenoh::TELEOP => (
+                "rmw_zenoh, commands beside a camera",
+                "Commands (50 Hz × 64 B) and a camera (30 Hz × 60 KB), both best effort, over the same uplink of 2 Mbit/s with a queue of \
+                 200 ms. Ages, from publishing to the subscriber. SGC sends commands as `realtime` and the camera as `bulk`; rmw_zenoh has its defaults. \
+                 CPU is that of Zenoh routers and `sgc` since their start.\n",
+                "",
+                Unit::Plain,
+                Plot::Nothing,
+            ),
+            rmw_zenoh::IDLE => (
+                "rmw_zenoh, idle processes",
+                "A Zenoh router that is connected to another, and proxies of `sgc` without topics, after 20 s at rest.\n",
+                "",
+                Unit::Plain,
+                Plot::Nothing,
+            ),
             "start-up" => (
                 "Start-up and advertisement",
                 "With so many records known to the router beforehand.\n",
@@ -260,13 +293,17 @@ impl About<'_> {
 
 /// The tables of a run, the known ones first and in their order.
 fn tables(figures: &Figures) -> Vec<&str> {
-    const ORDER: [&str; 14] = [
+    const ORDER: [&str; 18] = [
         "round-trip",
         "throughput",
         real_ros2::TABLE,
         real_ros2::KEEP_ALL,
         real_ros2::ROUND_TRIP,
         real_ros2::RESTART,
+        rmw_zenoh::TABLE,
+        rmw_zenoh::ROUND_TRIP,
+        rmw_zenoh::TELEOP,
+        rmw_zenoh::IDLE,
         "start-up",
         "applications",
         "fleet-step",
@@ -402,6 +439,7 @@ fn path_name(path: &str) -> String {
         "near" => "10 ms round trip (`near`)",
         "far" => "76 ms round trip (`far`)",
         "uplink" => "Uplink of 5 Mbit/s",
+        rmw_zenoh::UPLINK => "Uplink of 2 Mbit/s",
         "uplink-40ms" => "Uplink of 5 Mbit/s, 40 ms one way",
         other => return format!("`{other}`"),
     };
@@ -539,12 +577,13 @@ fn systems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
         "ssh",
         "zenoh-bridge",
     ];
+    let peers: Vec<_> = PEERS.into_iter().chain(WITH_RMW_ZENOH).collect();
     let mut systems = distinct(names);
     let place = |name: &&str| match Sgc::parse(name) {
-        None => (PEERS.iter().position(|peer| peer == name).unwrap_or(PEERS.len()), 0, 0, false),
+        None => (peers.iter().position(|peer| peer == name).unwrap_or(peers.len()), 0, 0, false),
         Some(sgc) => {
             let at = |all: &[&str], it: &str| all.iter().position(|one| *one == it).unwrap_or(all.len());
-            (PEERS.len() + 1, at(&SCHEMES, sgc.scheme), at(&SUITES, sgc.suite), sgc.is_routed)
+            (peers.len() + 1, at(&SCHEMES, sgc.scheme), at(&SUITES, sgc.suite), sgc.is_routed)
         }
     };
     systems.sort_by_key(place);
@@ -591,6 +630,12 @@ fn system_name(system: &str) -> String {
         "zenoh-tcp" => "Zenoh bridge, TCP",
         "zenoh-tls" => "Zenoh bridge, TLS",
         "zenoh-bridge" => "Zenoh bridge",
+        "rmw-zenoh-one-host" => "rmw_zenoh, one host",
+        "rmw-zenoh-one-router" => "rmw_zenoh, one Zenoh router",
+        "rmw-zenoh-two-routers" => "rmw_zenoh, two Zenoh routers",
+        "sgc-zenoh-zenoh" => "sgc, Zenoh to Zenoh",
+        "sgc-dds-zenoh" => "sgc, DDS to Zenoh",
+        "sgc-dds-dds" => "sgc, DDS to DDS",
         "ssh" => "SSH and SFTP",
         "sgc-proxy" => "sgc proxy that shares",
         "sgc-proxy-use" => "sgc proxy that uses",
@@ -626,7 +671,11 @@ fn look(system: &str) -> (Hue, Stroke) {
         "wireguard" => (Hue::Orange, Stroke::Solid),
         "dds-security" => (Hue::Olive, Stroke::Solid),
         "zenoh-tls" => (Hue::Pink, Stroke::Dashed),
-        s if s.starts_with("zenoh") => (Hue::Pink, Stroke::Solid),
+        "rmw-zenoh-one-host" => (Hue::Pink, Stroke::Dotted),
+        "rmw-zenoh-one-router" => (Hue::Pink, Stroke::Dashed),
+        "sgc-dds-zenoh" => (Hue::Blue, Stroke::Dashed),
+        "sgc-dds-dds" => (Hue::Blue, Stroke::Dotted),
+        s if s.starts_with("zenoh") || s.starts_with("rmw-zenoh") => (Hue::Pink, Stroke::Solid),
         "ssh" | "rosbridge" => (Hue::Brown, Stroke::Solid),
         s if s.contains("router") => (Hue::Teal, Stroke::Solid),
         _ => (Hue::Blue, Stroke::Solid),

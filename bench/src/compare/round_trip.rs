@@ -66,20 +66,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
                 }
             }
         }
-        for ((name, size), Sample { round_trips_us, lost, patience }) in samples {
-            let mut push =
-                |metric, value| figures.push("round-trip", &name, kind.name(), size as f64, metric, value);
-            push("lost", lost as f64);
-            push("samples", round_trips_us.len() as f64);
-            if !round_trips_us.is_empty() {
-                let spread = Spread::from_samples(round_trips_us);
-                push("p50_us", spread.p50);
-                push("p99_us", spread.p99);
-                push("max_us", spread.max);
-            } else if lost > 0 {
-                push(GAVE_UP, patience.as_secs_f64() * 1e6);
-            }
-        }
+        push(samples, "round-trip", kind.name(), figures);
     }
     Ok(())
 }
@@ -90,6 +77,23 @@ fn sizes(kind: &PathKind, quick: bool) -> &'static [usize] {
         PathKind::Bare => &SIZES,
         _ if quick => &SIZES[..3],
         _ => &SIZES,
+    }
+}
+
+/// Writes the figures of samples down.
+pub(crate) fn push(samples: Samples, table: &str, path: &str, figures: &mut Figures) {
+    for ((name, size), Sample { round_trips_us, lost, patience }) in samples {
+        let mut push = |metric, value| figures.push(table, &name, path, size as f64, metric, value);
+        push("lost", lost as f64);
+        push("samples", round_trips_us.len() as f64);
+        if !round_trips_us.is_empty() {
+            let spread = Spread::from_samples(round_trips_us);
+            push("p50_us", spread.p50);
+            push("p99_us", spread.p99);
+            push("max_us", spread.max);
+        } else if lost > 0 {
+            push(GAVE_UP, patience.as_secs_f64() * 1e6);
+        }
     }
 }
 

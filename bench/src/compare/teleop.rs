@@ -12,7 +12,7 @@ use sgc_testkit::netsim::{Direction, Profile, QueueLimit};
 
 use super::lab::{Lab, PathKind, Side};
 use super::program::Program;
-use super::system::{System, Topic};
+use super::system::{Running, System, Topic};
 use super::turns::abreast;
 use super::{Compare, Figures};
 
@@ -36,13 +36,13 @@ const QUIET_SECONDS: f64 = 3.0;
 /// How much longer something may take than it says.
 const SPARE: Duration = Duration::from_secs(60);
 
-/// One of the three flows.
-struct Flow {
+/// A flow at a rate of its own.
+pub(crate) struct Flow {
     /// Prefix of its figures.
-    figures: &'static str,
-    topic: Topic,
-    per_second: f64,
-    bytes: usize,
+    pub(crate) figures: &'static str,
+    pub(crate) topic: Topic,
+    pub(crate) per_second: f64,
+    pub(crate) bytes: usize,
 }
 
 const FLOWS: [Flow; 3] = [
@@ -128,36 +128,12 @@ fn measure(
     let flows: Vec<_> = FLOWS.iter().filter(|flow| with_camera || flow.topic.reliable).collect();
     let topics: Vec<_> = flows.iter().map(|flow| flow.topic.clone()).collect();
     let running = system.start(&lab, &topics)?;
-    let mut programs = Vec::new();
-    for flow in &flows {
-        let mut args = vec!["", "--topic", flow.topic.name];
-        args.extend(flow.topic.reliable.then_some("--reliable"));
-        let towards = flow.topic.towards;
-        let mut start = |role, side| {
-            args[0] = role;
-            lab.load(&running, side, &args)
-        };
-        let mut sink = start("sink", towards)?;
-        sink.soon("up")?;
-        programs.push((*flow, start("source", towards.other())?, sink));
-    }
-    for (flow, _, sink) in &mut programs {
-        sink.until("connected", CONNECT_MAX).with_context(|| flow.topic.name)?;
-    }
     let seconds = if compare.is_quick() { QUICK_SECONDS } else { SECONDS };
-    for (flow, source, _) in &mut programs {
-        for (run, seconds) in [(1, WARM_UP_SECONDS), (2, seconds)] {
-            source.order(&json!({ "send": {
-                "run": run, "size": flow.bytes, "count": u32::MAX, "seconds": seconds, "rate": flow.per_second,
-            }}))?;
-        }
-    }
-    for (flow, source, sink) in &mut programs {
+    for (flow, outcome) in flows.iter().zip(drive(&lab, &running, &flows, seconds)?) {
         let mut push = |metric: &str, value| {
             let (at, metric) = (f64::from(u8::from(with_camera)), format!("{}_{metric}", flow.figures));
             figures.push("teleop", &system.name(), lab.kind.name(), at, &metric, value);
         };
-        let outcome = outcome(source, sink, seconds).with_context(|| flow.topic.name)?;
         push("sent", outcome.sent as f64);
         push("lost", outcome.sent.saturating_sub(outcome.heard) as f64);
         push("per_second", outcome.heard as f64 / seconds);
@@ -176,11 +152,45 @@ fn measure(
     Ok(())
 }
 
+/// Lets flows go at the same time, for so long after a warm-up, and returns their results.
+pub(crate) fn drive(lab: &Lab, running: &Running, flows: &[&Flow], seconds: f64) -> Result<Vec<Outcome>> {
+    let mut programs = Vec::new();
+    for flow in flows {
+        let mut args = vec!["", "--topic", flow.topic.name];
+        args.extend(flow.topic.reliable.then_some("--reliable"));
+        let towards = flow.topic.towards;
+        let mut start = |role, side| {
+            args[0] = role;
+            lab.load(running, side, &args)
+        };
+        let mut sink = start("sink", towards)?;
+        sink.soon("up")?;
+        programs.push((*flow, start("source", towards.other())?, sink));
+    }
+    for (flow, _, sink) in &mut programs {
+        sink.until("connected", CONNECT_MAX).with_context(|| flow.topic.name)?;
+    }
+    for (flow, source, _) in &mut programs {
+        for (run, seconds) in [(1, WARM_UP_SECONDS), (2, seconds)] {
+            source.order(&json!({ "send": {
+                "run": run, "size": flow.bytes, "count": u32::MAX, "seconds": seconds, "rate": flow.per_second,
+            }}))?;
+        }
+    }
+    let outcomes = programs
+        .iter_mut()
+        .map(|(flow, source, sink)| outcome(source, sink, seconds).with_context(|| flow.topic.name));
+    outcomes.collect()
+}
+
 /// The result of a flow.
-struct Outcome {
-    sent: u64,
-    heard: u64,
-    age_us: [f64; 3],
+pub(crate) struct Outcome {
+    /// Messages written.
+    pub(crate) sent: u64,
+    /// Messages that arrived.
+    pub(crate) heard: u64,
+    /// From before a message was written until it was taken: p50, p99, most, µs.
+    pub(crate) age_us: [f64; 3],
 }
 
 fn outcome(source: &mut Program, sink: &mut Program, seconds: f64) -> Result<Outcome> {

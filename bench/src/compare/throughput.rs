@@ -49,8 +49,8 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     Ok(())
 }
 
-/// Anew for each size, so that memory is that of the size.
-fn measure(compare: &Compare, system: &dyn System, size: usize, tally: &mut Tally) -> Result<()> {
+/// Measures a run over the bare path through a system that is started anew, so that memory is that of the size.
+pub(crate) fn measure(compare: &Compare, system: &dyn System, size: usize, tally: &mut Tally) -> Result<()> {
     let (kind, name) = (PathKind::Bare, system.name());
     let (outcome, rss_bytes) = one_way(compare, system, size)?;
     let mut add = |metric, value| tally.add(&name, kind.name(), size as u64, metric, value);
@@ -62,7 +62,7 @@ fn measure(compare: &Compare, system: &dyn System, size: usize, tally: &mut Tall
     Ok(())
 }
 
-/// A run over the bare path through a system that is started anew, so that its memory, bytes, is that of the size.
+/// Returns the outcome of a run and the resident memory behind it, bytes.
 pub(crate) fn one_way(compare: &Compare, system: &dyn System, size: usize) -> Result<(Outcome, u64)> {
     let lab = Lab::new(PathKind::Bare, compare.load())?;
     let running = system.start(&lab, &[Topic { name: TOPIC, towards: Side::Right, reliable: true }])?;

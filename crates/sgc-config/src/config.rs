@@ -15,6 +15,7 @@ use crate::gateway::GatewayConfig;
 use crate::metrics::MetricsConfig;
 use crate::recipient::Recipient;
 use crate::router_url::RouterUrl;
+use crate::zenoh::{Middleware, ZenohConfig};
 
 /// The shortest configurable time between probes of a link.
 pub const KEEP_ALIVE_MIN: Duration = Duration::from_secs(1);
@@ -167,9 +168,11 @@ impl Default for TransportConfig {
 /// The local ROS 2 network.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RosConfig {
-    /// ROS domain id, 0 to [`DOMAIN_ID_MAX`](crate::DOMAIN_ID_MAX).
+    /// Middleware of the network's programs.
+    pub middleware: Middleware,
+    /// ROS domain id, 0 to [`DOMAIN_ID_MAX`](crate::DOMAIN_ID_MAX) for DDS, else any.
     pub domain_id: u32,
-    /// Range of discovery.
+    /// Range of discovery of DDS.
     pub discovery: DiscoveryRange,
     /// Further host names and IP addresses to discover. Empty if the range is `Off` or `SystemDefault`.
     pub static_peers: Vec<String>,
@@ -181,6 +184,8 @@ pub struct RosConfig {
     pub cyclonedds_uri: Option<String>,
     /// The enclave of a network that DDS Security protects.
     pub security: Option<SecurityConfig>,
+    /// Session of the network of rmw_zenoh; the default with [`Middleware::Dds`].
+    pub zenoh: ZenohConfig,
 }
 
 /// The enclave with which the local ROS 2 network is joined.
@@ -197,9 +202,17 @@ pub struct SecurityConfig {
 
 impl Default for RosConfig {
     fn default() -> Self {
-        let (discovery, static_peers) = (DiscoveryRange::default(), Vec::new());
-        let (definitions, cyclonedds_uri, security) = (Vec::new(), None, None);
-        Self { domain_id: 0, discovery, static_peers, graph: true, definitions, cyclonedds_uri, security }
+        Self {
+            middleware: Middleware::default(),
+            domain_id: 0,
+            discovery: DiscoveryRange::default(),
+            static_peers: Vec::new(),
+            graph: true,
+            definitions: Vec::new(),
+            cyclonedds_uri: None,
+            security: None,
+            zenoh: ZenohConfig::default(),
+        }
     }
 }
 

@@ -93,6 +93,7 @@ pub(crate) struct Words {
 /// `[ros]`.
 #[derive(Debug, Default)]
 pub(crate) struct RosDraft {
+    pub(crate) middleware: Option<WithOrigin<String>>,
     pub(crate) domain_id: Option<WithOrigin<i64>>,
     pub(crate) localhost_only: Option<WithOrigin<bool>>,
     pub(crate) discovery_range: Option<WithOrigin<String>>,
@@ -102,6 +103,31 @@ pub(crate) struct RosDraft {
     pub(crate) definitions: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(crate) enclave: Option<WithOrigin<String>>,
     pub(crate) security_root: Option<WithOrigin<String>>,
+    pub(crate) zenoh: Option<ZenohDraft>,
+}
+
+impl RosDraft {
+    /// Iterates over the keys that only DDS Security has, with their origins.
+    pub(crate) fn security(&self) -> impl Iterator<Item = (&'static str, &Origin)> {
+        [&self.enclave, &self.security_root].into_iter().flatten().map(|one| (one.key, &one.origin))
+    }
+
+    /// Iterates over the keys of the discovery of DDS, with their origins.
+    pub(crate) fn discovery(&self) -> impl Iterator<Item = (&'static str, &Origin)> {
+        let range = self.discovery_range.iter().map(|one| (one.key, &one.origin));
+        let only = self.localhost_only.iter().map(|one| (one.key, &one.origin));
+        let peers = self.static_peers.iter().map(|one| (one.key, &one.origin));
+        range.chain(only).chain(peers)
+    }
+}
+
+/// `[ros.zenoh]`.
+#[derive(Debug)]
+pub(crate) struct ZenohDraft {
+    /// The place of the table.
+    pub(crate) origin: Origin,
+    pub(crate) router: Option<WithOrigin<String>>,
+    pub(crate) config: Option<WithOrigin<PathBuf>>,
 }
 
 /// `[[share]]`. Required fields are `None` only if an error was recorded.

@@ -17,6 +17,7 @@ use crate::gateway::{GatewayUrl, GatewayUrlError};
 use crate::metrics::OtlpUrlError;
 use crate::router_url::RouterUrlError;
 use crate::units::{duration_text, rate_text, size_text};
+use crate::zenoh::{ZENOH_OVERRIDE_KEY_BYTES_MAX, ZENOH_OVERRIDE_VALUE_BYTES_MAX};
 
 /// All mistakes, in the order of the file; never empty.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -462,6 +463,62 @@ pub enum Mistake {
         key: &'static str,
         /// The fault.
         fault: TokenError,
+    },
+    /// Networks of rmw_zenoh in a build without them.
+    #[error(
+        "`{key}` is {value:?}, and this sgc is built without Zenoh: build it with `cargo build --release -p sgc --features \
+         zenoh`, or leave it out"
+    )]
+    ZenohNotBuilt {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// A value that is no endpoint of a router of Zenoh.
+    #[error(
+        "`{key}` is {value:?}; a router of Zenoh is tcp/HOST:PORT, tls/HOST:PORT or unixsock-stream/PATH: \
+         \"tcp/localhost:7447\", for example"
+    )]
+    ZenohRouter {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// A session configuration in a format that Zenoh does not read.
+    #[error("`{key}` is {value:?}; Zenoh knows the format by the ending: .json5, .json, .yaml or .yml")]
+    ZenohConfigEnding {
+        /// The key or variable.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// A URI that is no path of a file.
+    #[error("`{key}` is {value:?}; it takes a path, or file:// and an absolute path")]
+    ZenohConfigUri {
+        /// The variable.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// A malformed setting in a list of them. Values are not repeated, since they may be passwords.
+    #[error("`{key}`: setting {number} {fault}")]
+    ZenohOverride {
+        /// The variable.
+        key: &'static str,
+        /// The place of the setting in the list, counted from 1.
+        number: usize,
+        /// The fault.
+        fault: ZenohOverrideFault,
+    },
+    /// A value that is no number of attempts.
+    #[error("`{key}` is {value:?}; it takes a number: 0, a positive or a negative one")]
+    RouterCheck {
+        /// The variable.
+        key: &'static str,
+        /// The value.
+        value: String,
     },
     /// A value that is no ROS domain id.
     #[error("`{key}` is {value}; a ROS domain id is a number from 0 to {max}")]
@@ -1066,6 +1123,36 @@ pub enum Mistake {
         /// The key that enables listening.
         listen: &'static str,
     },
+    /// The table `[ros.zenoh]` without a network of rmw_zenoh.
+    #[error(
+        "[ros.zenoh] is for a network of rmw_zenoh, and the node joins none: set middleware = \"zenoh\" or \"both\" in \
+         [ros], or take the table out"
+    )]
+    ZenohUnused,
+    /// A key of DDS without a DDS network.
+    #[error(
+        "`{key}` is for DDS, and `middleware` is \"zenoh\": take it out; `router` in [ros.zenoh] names the router that \
+         the node connects to"
+    )]
+    DdsKey {
+        /// The key.
+        key: &'static str,
+    },
+    /// A key of DDS Security without a DDS network.
+    #[error(
+        "`{key}` is for DDS Security, and `middleware` is \"zenoh\", so nothing would be protected: take it out; a session \
+         configuration, `config` in [ros.zenoh], protects a network of rmw_zenoh"
+    )]
+    DdsSecurityKey {
+        /// The key.
+        key: &'static str,
+    },
+    /// The environment asks for security, and nothing protects the network of rmw_zenoh.
+    #[error(
+        "ROS_SECURITY_STRATEGY is \"Enforce\", and nothing protects the network of rmw_zenoh: name its session \
+         configuration in `config` of [ros.zenoh], or in ZENOH_SESSION_CONFIG_URI, or unset ROS_SECURITY_ENABLE"
+    )]
+    ZenohUnprotected,
     /// Two settings that exclude each other.
     #[error("`{key}` is {value}, but `{other}` is {other_value}: {right}")]
     Contradiction {
@@ -1162,6 +1249,36 @@ pub enum Mistake {
         /// Its permission bits.
         mode: u32,
     },
+}
+
+/// The faults of a setting `KEY=VALUE` for Zenoh.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ZenohOverrideFault {
+    /// There is no `=`.
+    #[error("is not KEY=VALUE; `;` separates settings: mode=\"client\";scouting/multicast/enabled=false")]
+    NoEquals,
+    /// The key is empty, or has a space or another character that no key has.
+    #[error("has the key {0:?}; a key is like connect/endpoints, without spaces")]
+    Key(String),
+    /// The key is too long.
+    #[error("has a key of {0} bytes; a key has at most {ZENOH_OVERRIDE_KEY_BYTES_MAX}")]
+    KeyLength(usize),
+    /// There is no value.
+    #[error("gives {0} no value; values are JSON5, such as true, or [\"tcp/localhost:7447\"]")]
+    NoValue(String),
+    /// The value is too long.
+    #[error("gives {key} a value of {bytes} bytes; a value has at most {ZENOH_OVERRIDE_VALUE_BYTES_MAX}")]
+    ValueLength {
+        /// The key.
+        key: String,
+        /// The length of the value.
+        bytes: usize,
+    },
+    /// A string, an array or an object has no end.
+    #[error(
+        "gives {0} a value that ends in the middle of a string, an array or an object; each `;` ends a setting, also in quotes"
+    )]
+    Unclosed(String),
 }
 
 /// The rules of a fully qualified ROS 2 topic name (`rmw_validate_full_topic_name`).

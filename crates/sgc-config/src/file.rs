@@ -14,7 +14,7 @@ use toml::de::{DeTable, DeValue};
 use crate::draft::{
     AuditDraft, Draft, GatewayClientDraft, GatewayDraft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft,
     RosDraft, RotationDraft, ShapingDraft, ShareDraft, StoreDraft, TransportDraft, UseDraft, WithOrigin,
-    Words,
+    Words, ZenohDraft,
 };
 use crate::error::{ConfigError, Mistake, Origin};
 use crate::schema::{Table, nearest};
@@ -191,9 +191,11 @@ impl FileReader<'_> {
     }
 
     fn ros(&mut self, ros: &Section<'_, '_>) -> RosDraft {
+        let zenoh = self.single(ros, "ros.zenoh", Table::RosZenoh).map(|zenoh| self.zenoh(&zenoh));
         let ros = Some(ros);
         RosDraft {
-            domain_id: self.integer(ros, "domain_id", "a number from 0 to 232"),
+            middleware: self.string(ros, "middleware", "a string, \"dds\", \"zenoh\" or \"both\""),
+            domain_id: self.integer(ros, "domain_id", "a number, such as 7"),
             localhost_only: self.boolean(ros, "localhost_only", "true or false"),
             discovery_range: self.string(ros, "discovery_range", "a string, such as \"subnet\""),
             static_peers: self.strings(
@@ -209,6 +211,19 @@ impl FileReader<'_> {
             ),
             enclave: self.string(ros, "enclave", "a string, such as \"/sgc\""),
             security_root: self.string(ros, "security_root", "a string, such as \"/opt/robot/keystore\""),
+            zenoh,
+        }
+    }
+
+    fn zenoh(&mut self, zenoh: &Section<'_, '_>) -> ZenohDraft {
+        let origin = self.origin(zenoh.span.clone());
+        let zenoh = Some(zenoh);
+        ZenohDraft {
+            origin,
+            router: self.string(zenoh, "router", "a string, such as \"tcp/localhost:7447\""),
+            config: self
+                .string(zenoh, "config", "a string, such as \"session.json5\"")
+                .map(|config| config.map(PathBuf::from)),
         }
     }
 
@@ -440,14 +455,15 @@ impl FileReader<'_> {
         }
     }
 
-    /// Reads the table `[key]`.
+    /// Reads the table `[key]`. `top` has the last word of the key.
     fn single<'s, 't>(
         &mut self,
         top: &Section<'s, 't>,
         key: &'static str,
         table: Table,
     ) -> Option<Section<'s, 't>> {
-        let value = top.entries.get(key)?;
+        let name = key.rsplit('.').next().unwrap_or(key);
+        let value = top.entries.get(name)?;
         if let DeValue::Table(entries) = value.get_ref() {
             return Some(self.section(table, entries, value.span()));
         }

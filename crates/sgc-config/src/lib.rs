@@ -22,6 +22,7 @@ mod ros_env;
 mod router_url;
 mod schema;
 mod units;
+mod zenoh;
 
 use std::path::Path;
 
@@ -31,7 +32,7 @@ pub use config::{
     PEER_RATE_MAX, PEER_RATE_MIN, PartnerConfig, RosConfig, RotationConfig, SecurityConfig, ShareConfig,
     ShareMetadata, StoreSettings, TokenConfig, TokenSource, TransportConfig, UseConfig,
 };
-pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
+pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule, ZenohOverrideFault};
 pub use gateway::{
     GATEWAY_CLIENTS_MAX, GATEWAY_NAMES_MAX, GatewayClientConfig, GatewayConfig, GatewayScheme, GatewayTls,
     GatewayUrl, GatewayUrlError, ORIGINS_MAX,
@@ -48,6 +49,10 @@ pub use router_url::{RouterUrl, RouterUrlError, SRV_SERVICE, SrvDomain, WAYS_MAX
 pub use schema::{Table, nearest};
 pub use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping, TOPIC_BYTES_MAX};
 pub use units::{parse_duration, parse_rate};
+pub use zenoh::{
+    Middleware, RouterCheck, ZENOH_OVERRIDE_KEY_BYTES_MAX, ZENOH_OVERRIDE_VALUE_BYTES_MAX,
+    ZENOH_OVERRIDES_MAX, ZENOH_ROUTER_BYTES_MAX, ZENOH_ROUTER_DEFAULT, ZenohConfig,
+};
 
 impl Config {
     /// Resolves the command line without reading any file. The ROS environment applies as with a file.

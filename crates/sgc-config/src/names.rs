@@ -3,7 +3,7 @@
 //! Each function takes a text and returns the valid value or the mistake. `resolve` knows where the text comes from and
 //! how it relates to other settings.
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::time::Duration;
 
 use sgc_gateway::{PageOrigin, PageOriginError};
@@ -19,7 +19,9 @@ use crate::gateway::GatewayUrl;
 use crate::metrics::{OtlpUrl, OtlpUrlError};
 use crate::recipient::Recipient;
 use crate::router_url::{RouterUrl, RouterUrlError};
+use crate::schema::nearest;
 use crate::units::{parse_duration, parse_rate, parse_size};
+use crate::zenoh::{Middleware, ZENOH_ROUTER_BYTES_MAX};
 
 /// The longest frame prefix.
 pub const FRAME_PREFIX_BYTES_MAX: usize = 64;
@@ -356,6 +358,70 @@ pub(crate) fn otlp(key: &'static str, value: &str) -> Result<OtlpUrl, Mistake> {
         OtlpUrlError::Credentials => Mistake::OtlpCredentials { key },
         fault => Mistake::OtlpUrl { key, value: value.to_owned(), fault },
     })
+}
+
+/// Parses the middleware of the local network.
+pub(crate) fn middleware(key: &'static str, value: &str) -> Result<Middleware, Mistake> {
+    const WORDS: [&str; 3] = ["dds", "zenoh", "both"];
+    let middleware = match value {
+        "dds" => Middleware::Dds,
+        "zenoh" => Middleware::Zenoh,
+        "both" => Middleware::Both,
+        _ => {
+            let (value, nearest) = (value.to_owned(), nearest(value, &WORDS));
+            return Err(Mistake::UnknownWord { key, value, nearest, known: &WORDS });
+        }
+    };
+    if cfg!(not(feature = "zenoh")) && middleware.has_zenoh() {
+        return Err(Mistake::ZenohNotBuilt { key, value: value.to_owned() });
+    }
+    Ok(middleware)
+}
+
+/// Checks the endpoint of a router of Zenoh, `PROTOCOL/ADDRESS[?METADATA][#CONFIG]`.
+pub(crate) fn zenoh_router(key: &'static str, value: &str) -> Result<String, Mistake> {
+    let (bytes, max) = (value.len(), ZENOH_ROUTER_BYTES_MAX);
+    if bytes > max {
+        return Err(Mistake::TooLong { key, bytes, max });
+    }
+    if is_zenoh_endpoint(value) {
+        return Ok(value.to_owned());
+    }
+    // The text behind `#` may be a private key.
+    let (shown, secret) = split_off(value, '#');
+    let value = if secret.is_some() { format!("{shown}#...") } else { shown.to_owned() };
+    Err(Mistake::ZenohRouter { key, value })
+}
+
+fn is_zenoh_endpoint(text: &str) -> bool {
+    let (text, config) = split_off(text, '#');
+    let (text, metadata) = split_off(text, '?');
+    let Some((protocol, address)) = text.split_once('/') else { return false };
+    let is_address = match protocol {
+        "tcp" | "tls" => is_host_and_port(address),
+        "unixsock-stream" => !address.is_empty() && !address.contains(char::is_control),
+        _ => false,
+    };
+    is_address && [metadata, config].into_iter().flatten().all(is_list_of_settings)
+}
+
+/// Splits off the text behind the first `mark`, if there is one.
+fn split_off(text: &str, mark: char) -> (&str, Option<&str>) {
+    text.split_once(mark).map_or((text, None), |(text, rest)| (text, Some(rest)))
+}
+
+/// Returns `true` for `KEY=VALUE;KEY=VALUE`, where values may be missing.
+fn is_list_of_settings(text: &str) -> bool {
+    !text.contains('?') && text.split(';').all(|setting| !setting.is_empty() && !setting.starts_with('='))
+}
+
+fn is_host_and_port(address: &str) -> bool {
+    let Some((host, port)) = address.rsplit_once(':') else { return false };
+    let is_host = match host.strip_prefix('[').and_then(|host| host.strip_suffix(']')) {
+        Some(bare) => bare.parse::<Ipv6Addr>().is_ok(),
+        None => !host.contains(':') && is_host(host),
+    };
+    is_host && port.parse::<u16>().is_ok_and(|port| port != 0)
 }
 
 /// Parses the URL of a server of a store.

@@ -3,6 +3,7 @@
 //! All mistakes are collected. Consequential mistakes are not reported: an invalid value takes no part in comparisons.
 
 mod gateway_table;
+mod zenoh_table;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -31,6 +32,7 @@ use crate::names;
 use crate::recipient::Recipient;
 use crate::ros_env::{self, Environment};
 use crate::schema::nearest;
+use crate::zenoh::Middleware;
 
 /// Most shares of one node.
 pub const SHARES_MAX: usize = 1024;
@@ -109,6 +111,8 @@ pub struct FileChecks {
     pub headers: fn(&'static str, &Path) -> Result<(), Mistake>,
     /// Checks a file with the password of a store's user.
     pub password: fn(&'static str, &Path) -> Result<(), Mistake>,
+    /// Checks a session configuration of Zenoh.
+    pub zenoh: fn(&'static str, &Path) -> Result<(), Mistake>,
     /// Checks a directory of message definitions.
     pub directory: fn(&'static str, &Path) -> Result<(), Mistake>,
 }
@@ -149,9 +153,11 @@ pub(crate) fn resolve(
     let ros = touches_ros.then(|| {
         let nothing = RosDraft::default();
         let written = draft.ros.as_ref().unwrap_or(&nothing);
-        let ros = ros_env::resolve(written, env, &mut resolver.errors);
-        let security = resolver.security(written, env);
-        RosConfig { definitions: resolver.definitions(written), security, ..ros }
+        let middleware = resolver.middleware(written, attempted("middleware"));
+        let ros = ros_env::resolve(written, middleware, env, &mut resolver.errors);
+        let security = resolver.security(written, middleware, env);
+        let zenoh = resolver.zenoh(written, middleware, env);
+        RosConfig { definitions: resolver.definitions(written), security, zenoh, ..ros }
     });
     let partners = resolver.partners(draft);
     let shares = resolver.shares(draft, node_name.as_ref());
@@ -583,10 +589,18 @@ impl Resolver<'_> {
         valid
     }
 
-    /// Returns the enclave of the file, or else of the environment as rcl reads it.
-    fn security(&mut self, written: &RosDraft, env: Environment<'_>) -> Option<SecurityConfig> {
-        let variable = |name| env(name).filter(|value| !value.is_empty());
-        let is_written = written.enclave.is_some() || written.security_root.is_some();
+    /// Returns the enclave of the file, or else of the environment as rcl reads it. Without a DDS network there is none.
+    fn security(
+        &mut self,
+        written: &RosDraft,
+        middleware: Option<Middleware>,
+        env: Environment<'_>,
+    ) -> Option<SecurityConfig> {
+        if !middleware.is_none_or(Middleware::has_dds) {
+            return None;
+        }
+        let variable = |name| ros_env::variable(env, name);
+        let is_written = written.security().next().is_some();
         if !is_written && variable(ros_env::SECURITY_ENABLE).as_deref() != Some("true") {
             return None;
         }

@@ -8,6 +8,7 @@ use crate::draft::{RosDraft, WithOrigin};
 use crate::error::{ConfigError, Mistake, Origin};
 use crate::names;
 use crate::schema::nearest;
+use crate::zenoh::Middleware;
 
 /// Looks up an environment variable. It is `&|name| std::env::var(name).ok()` outside of tests.
 pub type Environment<'e> = &'e dyn Fn(&str) -> Option<String>;
@@ -36,12 +37,29 @@ const RANGES: [(&str, &str, DiscoveryRange); 4] = [
 const RANGES_IN_FILE: [&str; 4] = [RANGES[0].0, RANGES[1].0, RANGES[2].0, RANGES[3].0];
 const RANGES_IN_ENVIRONMENT: [&str; 4] = [RANGES[0].1, RANGES[1].1, RANGES[2].1, RANGES[3].1];
 
-/// Resolves the settings. Mistakes are added to `errors` and leave defaults.
-pub(crate) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<ConfigError>) -> RosConfig {
+/// Resolves the settings. Mistakes are added to `errors` and leave defaults. Without a DDS network, the keys and the
+/// variables of its discovery are not read. An unknown middleware, which has an error, may be either.
+pub(crate) fn resolve(
+    ros: &RosDraft,
+    middleware: Option<Middleware>,
+    env: Environment<'_>,
+    errors: &mut Vec<ConfigError>,
+) -> RosConfig {
+    let domain_id_max = if middleware.is_some_and(Middleware::has_dds) { DOMAIN_ID_MAX } else { u32::MAX };
     let domain_id = match &ros.domain_id {
-        Some(id) => keep(file_domain_id(id), errors),
-        None => keep(env_domain_id(env), errors),
+        Some(id) => keep(file_domain_id(id, domain_id_max), errors),
+        None => keep(env_domain_id(env, domain_id_max), errors),
     };
+    let resolved = RosConfig {
+        middleware: middleware.unwrap_or_default(),
+        domain_id: domain_id.unwrap_or(0),
+        graph: ros.graph.as_ref().is_none_or(|graph| graph.value),
+        // Directories of relative paths are unknown here, so the caller adds what has paths.
+        ..RosConfig::default()
+    };
+    if !middleware.is_none_or(Middleware::has_dds) {
+        return resolved;
+    }
     let range = match file_range(ros) {
         Some(range) => keep(range, errors),
         None => keep(env_range(env, ros.localhost_only.is_none()), errors),
@@ -54,15 +72,10 @@ pub(crate) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<Con
         None => keep(env_peers(env), errors).unwrap_or_default(),
     };
     RosConfig {
-        domain_id: domain_id.unwrap_or(0),
         discovery: range.value,
         static_peers,
-        graph: ros.graph.as_ref().is_none_or(|graph| graph.value),
-        // The directory of relative paths is unknown here.
-        definitions: Vec::new(),
         cyclonedds_uri: variable(env, CYCLONEDDS_URI),
-        // The keystore's place is unknown here as well.
-        security: None,
+        ..resolved
     }
 }
 
@@ -70,7 +83,7 @@ fn keep<T>(result: Result<T, ConfigError>, errors: &mut Vec<ConfigError>) -> Opt
     result.map_err(|error| errors.push(error)).ok()
 }
 
-fn variable(env: Environment<'_>, name: &str) -> Option<String> {
+pub(crate) fn variable(env: Environment<'_>, name: &str) -> Option<String> {
     // ROS 2 treats an empty variable as unset.
     env(name).filter(|value| !value.is_empty())
 }
@@ -79,24 +92,18 @@ fn environment_error(mistake: Mistake) -> ConfigError {
     ConfigError::new(Origin::Environment, mistake)
 }
 
-fn file_domain_id(id: &WithOrigin<i64>) -> Result<u32, ConfigError> {
+fn file_domain_id(id: &WithOrigin<i64>, max: u32) -> Result<u32, ConfigError> {
     match u32::try_from(id.value) {
-        Ok(value) if value <= DOMAIN_ID_MAX => Ok(value),
-        _ => {
-            Err(id.error(Mistake::DomainId { key: id.key, value: id.value.to_string(), max: DOMAIN_ID_MAX }))
-        }
+        Ok(value) if value <= max => Ok(value),
+        _ => Err(id.error(Mistake::DomainId { key: id.key, value: id.value.to_string(), max })),
     }
 }
 
-fn env_domain_id(env: Environment<'_>) -> Result<u32, ConfigError> {
+fn env_domain_id(env: Environment<'_>, max: u32) -> Result<u32, ConfigError> {
     let Some(value) = variable(env, DOMAIN_ID) else { return Ok(0) };
     match c_number(value.trim()) {
-        Some(id) if id <= DOMAIN_ID_MAX => Ok(id),
-        _ => Err(environment_error(Mistake::DomainId {
-            key: DOMAIN_ID,
-            value: format!("{value:?}"),
-            max: DOMAIN_ID_MAX,
-        })),
+        Some(id) if id <= max => Ok(id),
+        _ => Err(environment_error(Mistake::DomainId { key: DOMAIN_ID, value: format!("{value:?}"), max })),
     }
 }
 

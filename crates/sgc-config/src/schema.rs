@@ -12,6 +12,8 @@ pub enum Table {
     Node,
     /// `[ros]`
     Ros,
+    /// `[ros.zenoh]`
+    RosZenoh,
     /// `[[share]]`
     Share,
     /// `[[use]]`
@@ -40,10 +42,11 @@ pub enum Table {
 
 impl Table {
     /// All tables, in the order of the reference.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::Top,
         Self::Node,
         Self::Ros,
+        Self::RosZenoh,
         Self::Share,
         Self::Use,
         Self::Partner,
@@ -64,6 +67,7 @@ impl Table {
             Self::Top => "the top level",
             Self::Node => "[node]",
             Self::Ros => "[ros]",
+            Self::RosZenoh => "[ros.zenoh]",
             Self::Share => "[[share]]",
             Self::Use => "[[use]]",
             Self::Router => "[router]",
@@ -111,6 +115,7 @@ impl Table {
                 "watch",
             ],
             Self::Ros => &[
+                "middleware",
                 "domain_id",
                 "discovery_range",
                 "localhost_only",
@@ -119,7 +124,9 @@ impl Table {
                 "definitions",
                 "enclave",
                 "security_root",
+                "zenoh",
             ],
+            Self::RosZenoh => &["router", "config"],
             Self::Share => &[
                 "topic",
                 "service",
@@ -223,6 +230,7 @@ impl Table {
         match self {
             Self::Top => &["profile"],
             Self::Ros
+            | Self::RosZenoh
             | Self::Node
             | Self::Router
             | Self::Transport
@@ -239,9 +247,16 @@ impl Table {
     }
 
     /// Returns the tables that have `key`, with the key. Tables within tables do not count: a `router` in `[node]` is
-    /// no misplaced `[router]`.
+    /// no misplaced `[router]`. Nor do the keys of `[ros.zenoh]`, whose words are too common.
     pub(crate) fn homes(key: &str) -> Option<(&'static str, Vec<&'static str>)> {
-        let has = |table: &&Self| table.keys().contains(&key) && (**table != Self::Top || key == "identity");
+        let has = |table: &&Self| {
+            let counts = match table {
+                Self::Top => key == "identity",
+                Self::RosZenoh => false,
+                _ => true,
+            };
+            counts && table.keys().contains(&key)
+        };
         let homes: Vec<Self> = Self::ALL.iter().filter(has).copied().collect();
         let known = homes.first()?.keys().iter().find(|known| **known == key)?;
         Some((known, homes.into_iter().map(Self::header).collect()))

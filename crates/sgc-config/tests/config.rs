@@ -497,7 +497,7 @@ fn tables_and_values_of_the_wrong_type_are_told() {
         ),
         (
             "[ros]\ndomain_id = '0'",
-            &["node.toml:4: `domain_id` is a string ('0'); it takes a number from 0 to 232"],
+            &["node.toml:4: `domain_id` is a string ('0'); it takes a number, such as 7"],
         ),
         (
             "[ros]\nlocalhost_only = 1",
@@ -1877,7 +1877,8 @@ fn the_examples_of_the_reference_are_valid() {
     let examples: Vec<&str> =
         text.split("```toml\n").skip(1).filter_map(|rest| Some(rest.split_once("```")?.0)).collect();
     assert!(examples.len() >= 4);
-    for example in examples {
+    let is_built = |example: &&str| cfg!(feature = "zenoh") || !example.contains("[ros.zenoh]");
+    for example in examples.into_iter().filter(is_built) {
         good(example);
     }
 }

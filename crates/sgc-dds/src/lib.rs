@@ -45,7 +45,6 @@ mod log;
 mod manual_leases;
 mod matched;
 mod network;
-mod pace;
 mod participant;
 pub mod payload;
 mod plugin_domain;

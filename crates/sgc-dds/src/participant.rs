@@ -13,7 +13,7 @@ use cyclors::{
 };
 use sgc_ros::graph::graph_writer;
 use sgc_ros::{DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, Guid, RosError};
-use sgc_sync::{Workers, lock};
+use sgc_sync::{Pace, Workers, lock};
 
 use crate::announced;
 use crate::backpressure::RemoteWriters;
@@ -23,7 +23,6 @@ use crate::entity::{Entity, check};
 use crate::first_messages::{self, EndpointWatch};
 use crate::local_nodes::LocalNodes;
 use crate::log;
-use crate::pace::Pace;
 use crate::plugin_domain;
 use crate::qos::NativeQos;
 use crate::same_host::{SameHost, Silence};

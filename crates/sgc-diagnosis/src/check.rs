@@ -9,6 +9,7 @@ use sgc_gateway::Anonymous;
 use sgc_node::alerts::{Alert, clock_alert};
 use sgc_node::config::{
     Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig, TokenSource,
+    ZenohConfig,
 };
 use sgc_node::discovery_server;
 use sgc_process::files;
@@ -86,7 +87,14 @@ pub fn summary(
                 [] => String::new(),
                 peers => format!(", and {}", peers.join(", ")),
             };
-            row("ROS 2", format!("domain {}, {range}{peers}", ros.domain_id));
+            let (domain, middleware) = (ros.domain_id, ros.middleware);
+            if middleware.has_dds() {
+                row("ROS 2", format!("domain {domain}, {range}{peers}"));
+            }
+            if middleware.has_zenoh() {
+                let kind = if middleware.has_dds() { "" } else { "ROS 2" };
+                row(kind, format!("domain {domain} of rmw_zenoh, {}", zenoh_router(&ros.zenoh)));
+            }
         }
         None => row("ROS 2", format!("none: {} only", role_without_ros(config))),
     }
@@ -161,7 +169,7 @@ pub fn summary(
         });
         rows.extend(unusable.or(exposed).map(|text| vec![WARNING.to_owned(), text]));
     }
-    if let Some(ros) = &config.ros {
+    if let Some(ros) = config.ros.as_ref().filter(|ros| ros.middleware.has_dds()) {
         let reaches_out = ros.discovery == DiscoveryRange::Subnet && ros.cyclonedds_uri.is_none();
         let alone = reaches_out && !sgc_dds::has_outward_address();
         let alone = alone.then_some(Alert::LocalNetworkAlone);
@@ -244,6 +252,18 @@ fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
     rows
 }
 
+/// Returns the way to the router of a network of rmw_zenoh.
+fn zenoh_router(zenoh: &ZenohConfig) -> String {
+    let router = zenoh.router_address().map(|router| format!("by the router at {router}"));
+    let config = zenoh.config.as_ref().map(|config| format!("configured by {}", config.display()));
+    let texts: Vec<String> = router.into_iter().chain(config).collect();
+    match &texts[..] {
+        // Without both, a setting of the environment has the router.
+        [] => "by the router that ZENOH_CONFIG_OVERRIDE names".to_owned(),
+        texts => texts.join(", "),
+    }
+}
+
 /// Returns the role of a node that touches no ROS 2 network.
 fn role_without_ros(config: &Config) -> &'static str {
     match (&config.authority, config.listen.is_empty()) {
@@ -321,6 +341,18 @@ mod tests {
         assert_eq!(role_without_ros(&config), "the fleet's authority");
         config.listen = vec!["quic://127.0.0.1:0".parse().unwrap()];
         assert_eq!(role_without_ros(&config), "a router and the fleet's authority");
+    }
+
+    #[test]
+    fn check_reports_the_way_to_a_router_of_zenoh() {
+        let mut zenoh = ZenohConfig::default();
+        assert_eq!(zenoh_router(&zenoh), "by the router at tcp/localhost:7447");
+        zenoh.overrides.push(("connect/endpoints".to_owned(), "[]".to_owned()));
+        assert_eq!(zenoh_router(&zenoh), "by the router that ZENOH_CONFIG_OVERRIDE names");
+        zenoh.config = Some("/a/session.json5".into());
+        assert_eq!(zenoh_router(&zenoh), "configured by /a/session.json5");
+        zenoh.router = Some("tls/b:1#connect_private_key=k".to_owned());
+        assert_eq!(zenoh_router(&zenoh), "by the router at tls/b:1, configured by /a/session.json5");
     }
 
     #[test]

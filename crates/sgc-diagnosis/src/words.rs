@@ -247,7 +247,7 @@ impl RuleFinding {
             ),
             Self::Absent { .. } => {
                 "start what publishes it; if it runs, compare `domain_id` and `discovery_range` in [ros] with its ROS_DOMAIN_ID and \
-                 ROS_AUTOMATIC_DISCOVERY_RANGE; `sgc topic list` shows what there is"
+                 ROS_AUTOMATIC_DISCOVERY_RANGE, or `router` in [ros.zenoh] with its Zenoh router; `sgc topic list` shows what there is"
                     .into()
             }
         }
@@ -601,7 +601,7 @@ impl LocalFinding {
         Some(match self {
             Self::NoProvider { .. } => {
                 "start it; if it runs, compare `domain_id` and `discovery_range` in [ros] with its ROS_DOMAIN_ID and \
-                 ROS_AUTOMATIC_DISCOVERY_RANGE; `sgc topic list` shows what was discovered"
+                 ROS_AUTOMATIC_DISCOVERY_RANGE, or `router` in [ros.zenoh] with its Zenoh router; `sgc topic list` shows what was discovered"
                     .into()
             }
             Self::DefinitionsDiffer { .. } => "build them from one version of the interface package".into(),
@@ -610,7 +610,7 @@ impl LocalFinding {
             }
             Self::NoSubscriber { .. } => {
                 "start a subscriber; if one runs, compare `domain_id` and `discovery_range` in [ros] with its ROS_DOMAIN_ID and \
-                 ROS_AUTOMATIC_DISCOVERY_RANGE"
+                 ROS_AUTOMATIC_DISCOVERY_RANGE, or `router` in [ros.zenoh] with its Zenoh router"
                     .into()
             }
             Self::NoActionClient { .. } => {

@@ -1,10 +1,16 @@
 //! The protocol of rmw_zenoh: any text and bytes are read or refused, and what was read has the same meaning when it is
-//! written and read again. The first byte selects the codec.
+//! written and read again. Tokens that come and go are a graph. The first byte selects the part.
 
-use sgc_ros::ServiceTopic;
+use std::collections::BTreeSet;
+
+use sgc_ros::{DiscoveryEvent, ServiceTopic};
 use sgc_zenoh::{
-    Attachment, CodecError, Field, Gid, TOKEN_BYTES_MAX, Token, TopicInfo, ZenohId, decode_qos, encode_qos,
+    Attachment, CodecError, Field, Gid, Graph, TOKEN_BYTES_MAX, Token, TopicInfo, ZenohId, decode_qos,
+    encode_qos,
 };
+
+/// The least first byte that selects the graph.
+const GRAPH: u8 = 0xf0;
 
 /// Runs one input of the target.
 pub fn run(input: &[u8]) {
@@ -13,6 +19,9 @@ pub fn run(input: &[u8]) {
         return attachment(bytes);
     }
     let Ok(text) = std::str::from_utf8(bytes) else { return };
+    if *choice >= GRAPH {
+        return graph(text);
+    }
     match choice % 5 {
         1 => token(text),
         2 => key(text),
@@ -74,4 +83,34 @@ fn id(text: &str) {
         assert_eq!(id.to_string(), text);
         assert_eq!(id.is_of_sgc(), text.len() == 32 && text.starts_with("534743a75e1d"));
     }
+}
+
+/// The events of a graph add up: an endpoint appears once and vanishes once, and nothing is left of tokens that ended. Each
+/// line is a token that ends if it begins with `-`.
+fn graph(text: &str) {
+    let own = ZenohId::of_sgc([0; 10]);
+    let mut graph = Graph::new(0, own, true);
+    graph.watch();
+    let (mut declared, mut known) = (BTreeSet::new(), BTreeSet::new());
+    let mut take = |graph: &mut Graph| {
+        for event in graph.endpoint_events().into_iter().chain(graph.node_events()) {
+            match event {
+                DiscoveryEvent::Appeared(endpoint) => assert!(known.insert(endpoint.guid)),
+                DiscoveryEvent::Vanished { guid } => assert!(known.remove(&guid)),
+                _ => {}
+            }
+        }
+        known.len()
+    };
+    for line in text.lines() {
+        if let Some(token) = line.strip_prefix('-') {
+            graph.undeclare(token);
+            declared.remove(token);
+        } else if graph.declare(line).is_ok() {
+            declared.insert(line);
+        }
+        take(&mut graph);
+    }
+    declared.iter().for_each(|token| _ = graph.undeclare(token));
+    assert_eq!((take(&mut graph), graph.tokens()), (0, 0));
 }

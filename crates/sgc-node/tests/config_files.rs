@@ -116,6 +116,43 @@ fn files_of_a_store_are_looked_at() {
     );
 }
 
+#[cfg(feature = "zenoh")]
+#[test]
+fn session_configuration_of_zenoh_is_looked_at() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name);
+    fs::write(path("x"), "nothing").unwrap();
+    fs::set_permissions(path("x"), fs::Permissions::from_mode(0o600)).unwrap();
+    let zenoh = "[ros]\nmiddleware = 'zenoh'\n[ros.zenoh]\nconfig = 'session.json5'\n";
+    fs::write(path("node.toml"), format!("{NODE}{zenoh}")).unwrap();
+    let told = || {
+        let place = format!("{}/", dir.path().display());
+        load(&path("node.toml"), &no_env).map_err(|errors| errors.to_string().replace(&place, ""))
+    };
+    let expected = |reason: &str| {
+        format!(
+            "node.toml:6: `config` is session.json5: {reason}; it must be a session configuration of Zenoh, such as \
+             rmw_zenoh's, that this user may read"
+        )
+    };
+    assert_eq!(told(), Err(expected("No such file or directory (os error 2)")));
+    fs::write(path("session.json5"), "\n").unwrap();
+    assert_eq!(told(), Err(expected("it is empty")));
+    fs::write(path("session.json5"), " ".repeat((1 << 20) + 1)).unwrap();
+    assert_eq!(told(), Err(expected("it has more than 1048576 bytes")));
+    fs::write(path("session.json5"), "{ mode: 'client' }").unwrap();
+    let config = told().unwrap().ros.unwrap().zenoh.config;
+    assert_eq!(config, Some(path("session.json5")));
+    // The same holds for the variable.
+    fs::write(path("node.toml"), format!("{NODE}[ros]\nmiddleware = 'zenoh'\n")).unwrap();
+    let uri = |name: &str| (name == "ZENOH_SESSION_CONFIG_URI").then(|| "/nowhere/session.json5".to_owned());
+    let errors = load(&path("node.toml"), &uri).unwrap_err().to_string();
+    assert!(
+        errors.starts_with("environment: `ZENOH_SESSION_CONFIG_URI` is /nowhere/session.json5: No such"),
+        "{errors}"
+    );
+}
+
 #[test]
 fn the_identity_file_is_checked_when_loading() {
     let dir = tempfile::tempdir().unwrap();

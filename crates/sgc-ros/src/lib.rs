@@ -23,7 +23,7 @@ pub use network::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
     HandleCalls, HandleSamples, KeyHash, Reach, RequestHandler, RequestId, RosClient, RosError, RosNetwork,
     RosServer, RosWriter, Sample, SampleHandler, SampleHead, SampleKind, SentRequest, ServiceSpec,
-    ShownEndpoint, UnhandledCall,
+    SharedSamples, ShownEndpoint, UnhandledCall,
 };
 pub use qos::{
     KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosOverride, QosPolicy, RELIABLE_READER_DEPTH_MIN,

@@ -7,10 +7,11 @@
 use std::any::Any;
 use std::collections::BTreeSet;
 use std::fmt;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
+use sgc_sync::lock;
 use sgc_wire::{Qos, RosNode};
 
 /// The GUID of a DDS entity: 12 bytes of prefix, 4 of entity id (RTPS 2.5, 9.3.1).
@@ -223,6 +224,35 @@ impl<F: FnMut(Sample) + Send> HandleSamples for F {
 
 /// The handler of a reader's samples.
 pub type SampleHandler = Box<dyn HandleSamples>;
+
+/// A handler of several readers, which takes their samples one at a time.
+#[derive(Clone)]
+pub struct SharedSamples(Arc<Mutex<SampleHandler>>);
+
+impl SharedSamples {
+    /// Shares a handler among readers, each of which has a clone of this.
+    pub fn new(handler: SampleHandler) -> Self {
+        Self(Arc::new(Mutex::new(handler)))
+    }
+}
+
+impl HandleSamples for SharedSamples {
+    fn handle(&mut self, sample: Sample) {
+        lock(&self.0).handle(sample);
+    }
+
+    fn handle_at_once(&mut self, sample: Sample) -> Option<Sample> {
+        // Another reader may hold it.
+        match self.0.try_lock() {
+            Ok(mut handler) => handler.handle_at_once(sample),
+            Err(_) => Some(sample),
+        }
+    }
+
+    fn overrun(&mut self, samples: u64) {
+        lock(&self.0).overrun(samples);
+    }
+}
 
 /// The client of a service and the number of its request: the sample identity of RPC over DDS 1.0 (7.5.1.1.1).
 ///
@@ -475,6 +505,11 @@ pub trait RosNetwork: Send + Sync + 'static {
     /// Returns the names of other SGC nodes that are on this network as well, as far as they are known.
     fn nodes_here(&self) -> BTreeSet<String> {
         BTreeSet::new()
+    }
+
+    /// Returns the router that the network needs and is not connected to, if its programs need one.
+    fn missing_router(&self) -> Option<String> {
+        None
     }
 
     /// Shows an endpoint that represents a remote one in the local graph, with its type, type hash and QoS except for

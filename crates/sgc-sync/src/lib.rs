@@ -1,10 +1,13 @@
-//! Locks that stay usable after a panic of their holder, and [threads that queues share](Workers).
+//! Locks that stay usable after a panic of their holder, [threads that queues share](Workers), and a [limit on
+//! borrowed time](Pace) of threads that receive.
 //!
 //! Release builds abort on panic, so poison is seen in tests only. There the panic itself fails the test, and a second
 //! panic in another thread would hide it.
 
+mod pace;
 mod workers;
 
+pub use pace::Pace;
 pub use workers::{Work, Workers};
 
 use std::sync::{Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};

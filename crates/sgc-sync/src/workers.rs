@@ -1,14 +1,14 @@
 //! [`Workers`]: threads that queues share, so that an idle queue needs none.
 //!
 //! A piece of work keeps its thread for as long as it runs. A few pieces get a thread at once. Others wait for the
-//! first thread that is done. They get new ones if all may be blocked: if none was done for [`STALL`], or if the
-//! oldest piece has waited for [`WAIT_MAX`]; one new thread starts in each [`STALL`]. So work that blocks holds up
-//! others for moments only, and a burst of short work in many queues does not start a thread for each. Threads that
+//! first thread that is done. They get further ones if all may be blocked: if none was done for [`STALL`], or if the
+//! oldest piece has waited for [`WAIT_MAX`]; one further thread in each [`STALL`]. So work that blocks holds up
+//! others for moments only, and a burst of short work in many queues does not take a thread for each. Threads that
 //! have nothing to do wait for the next piece, the latest first, and end after a while.
 
 use std::collections::VecDeque;
 use std::io;
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -18,9 +18,10 @@ use crate::lock;
 const LINGER: Duration = Duration::from_secs(5);
 /// Threads without work that do not end, so that work that comes seldom need not wait until one has started.
 const KEPT: usize = 1;
-/// Most threads that are started without waiting for one that is done.
+/// Work that may run, beside what has run for [`STALL`] and may be blocked, before other work waits for a thread that is
+/// done.
 const AT_ONCE: usize = 4;
-/// Time without progress after which work that waits gets a new thread.
+/// Time without progress after which work that waits gets a further thread.
 const STALL: Duration = Duration::from_millis(2);
 /// Longest wait of work for a thread, whether there is progress or not.
 const WAIT_MAX: Duration = Duration::from_millis(50);
@@ -57,16 +58,12 @@ impl Workers {
     /// new thread, the work waits, and the log has a warning.
     pub fn run(&self, work: Arc<dyn Work>) {
         let pool = &self.0.0;
-        let mut state = lock(&pool.state);
-        if let Some(seat) = state.idle.pop() {
-            drop(state);
-            seat.give(Order::Run(work));
-        } else if state.threads < AT_ONCE {
-            state.threads += 1;
-            drop(state);
-            pool.grow(work);
+        let (now, mut state) = (Instant::now(), lock(&pool.state));
+        state.waiting.push_back((now, work));
+        if state.begun_lately(now) < AT_ONCE {
+            pool.begin(state, now);
         } else {
-            pool.queue(&mut state, work);
+            pool.watch_over(state);
         }
     }
 }
@@ -101,13 +98,15 @@ struct Pool {
 struct State {
     /// Threads without work, the latest last.
     idle: Vec<Arc<Seat>>,
+    /// When the work began that runs now.
+    running: Vec<Instant>,
     /// All threads but the watch.
     threads: usize,
     /// Work that waits for a thread, with the time at which it came.
     waiting: VecDeque<(Instant, Arc<dyn Work>)>,
     /// The last time at which waiting work got a thread.
     progress: Option<Instant>,
-    /// The last time at which waiting work got a new thread.
+    /// The last time at which waiting work got a further thread.
     growth: Option<Instant>,
     /// Whether a thread watches over work that waits.
     is_watched: bool,
@@ -122,8 +121,14 @@ struct Seat {
 }
 
 enum Order {
-    Run(Arc<dyn Work>),
+    Run(Begun),
     End,
+}
+
+/// Work that a thread has, and since when.
+struct Begun {
+    at: Instant,
+    work: Arc<dyn Work>,
 }
 
 impl Seat {
@@ -140,14 +145,27 @@ impl Seat {
 }
 
 impl State {
-    /// Takes the work that has waited longest.
-    fn take(&mut self) -> Option<Arc<dyn Work>> {
-        let (_, work) = self.waiting.pop_front()?;
-        self.progress = Some(Instant::now());
-        Some(work)
+    /// Takes the work that has waited longest, for a thread that begins it now. Returns the time at which it came, too.
+    fn take(&mut self, now: Instant) -> Option<(Instant, Begun)> {
+        let (came, work) = self.waiting.pop_front()?;
+        self.progress = Some(now);
+        self.running.push(now);
+        Some((came, Begun { at: now, work }))
     }
 
-    /// Returns when the work that has waited longest is to get a new thread.
+    /// Returns how much of the work that runs began so lately that it is hardly blocked.
+    fn begun_lately(&self, now: Instant) -> usize {
+        self.running.iter().filter(|at| now.saturating_duration_since(**at) < STALL).count()
+    }
+
+    /// Notes that the work that began at this time is done.
+    fn ended(&mut self, at: Instant) {
+        if let Some(place) = self.running.iter().position(|begun| *begun == at) {
+            self.running.swap_remove(place);
+        }
+    }
+
+    /// Returns when the work that has waited longest is to get a further thread.
     fn grows_at(&self) -> Option<Instant> {
         let (came, _) = self.waiting.front()?;
         let stalled = self.progress.map_or(*came, |progress| progress.max(*came)) + STALL;
@@ -157,9 +175,30 @@ impl State {
 }
 
 impl Pool {
-    /// Lets work wait for a thread.
-    fn queue(self: &Arc<Self>, state: &mut State, work: Arc<dyn Work>) {
-        state.waiting.push_back((Instant::now(), work));
+    /// Gives the work that has waited longest to a thread without any, or to a new one. Returns `false` if there is no room
+    /// for one.
+    fn begin(self: &Arc<Self>, mut state: MutexGuard<'_, State>, at: Instant) -> bool {
+        let Some((came, begun)) = state.take(at) else { return true };
+        if let Some(seat) = state.idle.pop() {
+            drop(state);
+            seat.give(Order::Run(begun));
+            return true;
+        }
+        state.threads += 1;
+        drop(state);
+        let work = Arc::clone(&begun.work);
+        let Err(error) = self.spawn(Some(begun)) else { return true };
+        self.warn(&error);
+        let mut state = lock(&self.state);
+        state.threads -= 1;
+        state.ended(at);
+        state.waiting.push_front((came, work));
+        self.watch_over(state);
+        false
+    }
+
+    /// Has a thread watch over work that waits.
+    fn watch_over(self: &Arc<Self>, mut state: MutexGuard<'_, State>) {
         if state.is_watched {
             if state.waiting.len() == 1 {
                 self.waits.notify_one();
@@ -169,55 +208,48 @@ impl Pool {
         let this = Arc::clone(self);
         let watch = thread::Builder::new().name(self.name.into()).spawn(move || this.watch());
         state.is_watched = watch.inspect_err(|error| self.warn(error)).is_ok();
-    }
-
-    /// Starts a thread, which is counted already, for work. Without room for it, the work waits.
-    fn grow(self: &Arc<Self>, work: Arc<dyn Work>) -> bool {
-        let Err(error) = self.spawn(Some(Arc::clone(&work))) else { return true };
-        self.warn(&error);
-        let mut state = lock(&self.state);
-        state.threads -= 1;
-        // A thread may have come to rest meanwhile.
-        match state.idle.pop() {
-            Some(seat) => seat.give(Order::Run(work)),
-            None => self.queue(&mut state, work),
+        if !state.is_watched && !state.idle.is_empty() {
+            self.begin(state, Instant::now());
         }
-        false
     }
 
     fn warn(&self, error: &io::Error) {
         tracing::warn!(%error, name = self.name, "no thread can start, so work waits for the thread of other work");
     }
 
-    fn spawn(self: &Arc<Self>, first: Option<Arc<dyn Work>>) -> io::Result<()> {
+    fn spawn(self: &Arc<Self>, first: Option<Begun>) -> io::Result<()> {
         let this = Arc::clone(self);
         thread::Builder::new().name(self.name.into()).spawn(move || this.serve(first)).map(drop)
     }
 
     /// Runs work until there is none for a while. This is what a thread does.
-    fn serve(&self, first: Option<Arc<dyn Work>>) {
+    fn serve(&self, first: Option<Begun>) {
         (self.prepare)();
         let seat = Arc::new(Seat::default());
-        let mut next = first.or_else(|| self.next(&seat));
-        while let Some(work) = next {
+        let mut next = first.or_else(|| self.next(&seat, None));
+        while let Some(Begun { at, work }) = next {
             work.run();
-            next = self.next(&seat);
+            next = self.next(&seat, Some(at));
         }
     }
 
-    /// Takes work that waits, or waits for work. Returns `None` if the thread is to end.
-    fn next(&self, seat: &Arc<Seat>) -> Option<Arc<dyn Work>> {
+    /// Takes work that waits, or waits for work; what the thread did before began at `ended`. Returns `None` if the thread
+    /// is to end.
+    fn next(&self, seat: &Arc<Seat>, ended: Option<Instant>) -> Option<Begun> {
         {
             let mut state = lock(&self.state);
-            let next = state.take();
+            if let Some(at) = ended {
+                state.ended(at);
+            }
+            let next = state.take(Instant::now());
             if next.is_some() || state.is_closed {
-                return next;
+                return next.map(|(_, begun)| begun);
             }
             state.idle.push(Arc::clone(seat));
         }
         loop {
             match seat.wait(self.linger) {
-                Some(Order::Run(work)) => return Some(work),
+                Some(Order::Run(begun)) => return Some(begun),
                 Some(Order::End) => return None,
                 None if self.leave(seat) => return None,
                 None => {}
@@ -235,7 +267,7 @@ impl Pool {
         true
     }
 
-    /// Starts threads for work that waits too long, until none has waited for a while.
+    /// Finds threads for work that waits too long, until none has waited for a while.
     fn watch(self: &Arc<Self>) {
         let mut state = lock(&self.state);
         loop {
@@ -245,11 +277,8 @@ impl Pool {
                 None => self.linger,
                 Some(at) if at > now => at - now,
                 Some(_) => {
-                    let work = state.take();
                     state.growth = Some(now);
-                    state.threads += 1;
-                    drop(state);
-                    if !work.is_none_or(|work| self.grow(work)) {
+                    if !self.begin(state, now) {
                         thread::sleep(RETRY);
                     }
                     state = lock(&self.state);
@@ -353,21 +382,40 @@ mod tests {
         drop(begin(&workers));
     }
 
-    #[test]
-    fn burst_of_short_work_starts_few_threads() {
-        struct Short(Sender<ThreadId>);
-        impl Work for Short {
-            fn run(self: Arc<Self>) {
-                thread::sleep(Duration::from_micros(200));
-                let _ = self.0.send(thread::current().id());
-            }
+    /// Work that takes a moment, and tells its thread.
+    struct Short(Sender<ThreadId>);
+
+    impl Work for Short {
+        fn run(self: Arc<Self>) {
+            thread::sleep(Duration::from_micros(200));
+            let _ = self.0.send(thread::current().id());
         }
-        let workers = workers();
+    }
+
+    /// Runs short work a hundred times at once. Returns the threads that did it.
+    fn burst(workers: &Workers) -> HashSet<ThreadId> {
         let (done, is_done) = channel();
         (0..100).for_each(|_| workers.run(Arc::new(Short(done.clone()))));
-        let threads: HashSet<_> = (0..100).map(|_| is_done.recv_timeout(PATIENCE).unwrap()).collect();
+        (0..100).map(|_| is_done.recv_timeout(PATIENCE).unwrap()).collect()
+    }
+
+    #[test]
+    fn burst_of_short_work_starts_few_threads() {
+        let threads = burst(&workers()).len();
         // More are there only if the machine stood still.
-        assert!(threads.len() < 50, "{} threads", threads.len());
+        assert!(threads < 50, "{threads} threads");
+    }
+
+    #[test]
+    fn threads_for_work_that_blocked_end_although_bursts_go_on() {
+        let workers = Workers::start_with("test", || (), Duration::from_millis(200)).unwrap();
+        drop((0..50).map(|_| begin(&workers)).collect::<Vec<_>>());
+        await_idle(&workers, 50);
+        let began = Instant::now();
+        while lock(&workers.0.0.state).threads > 2 * AT_ONCE {
+            assert!(began.elapsed() < PATIENCE, "threads end");
+            burst(&workers);
+        }
     }
 
     #[test]

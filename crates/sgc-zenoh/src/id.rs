@@ -30,6 +30,18 @@ impl ZenohId {
         Self(NonZeroU128::new(u128::from_be_bytes(bytes)).expect("the mark is not zero"))
     }
 
+    /// Returns the id of an ordinary program's session with the same random bytes.
+    pub fn without_mark(self) -> Self {
+        // The other bytes keep the number from being 0, unless all of them are; then the last bit does.
+        let rest = self.0.get() & (u128::MAX >> (8 * SGC_MARK.len()));
+        Self(NonZeroU128::new(rest).unwrap_or(NonZeroU128::MIN))
+    }
+
+    /// Returns the id with these bytes, the lowest first, as time stamps have it. There is none of zeros.
+    pub fn from_le_bytes(bytes: [u8; 16]) -> Option<Self> {
+        NonZeroU128::new(u128::from_le_bytes(bytes)).map(Self)
+    }
+
     /// Returns `true` if the session is one of SGC, in this process or another, on this host or another. What it
     /// announces and publishes came through SGC already.
     pub fn is_of_sgc(self) -> bool {

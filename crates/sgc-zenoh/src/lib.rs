@@ -11,6 +11,7 @@
 mod attachment;
 mod error;
 mod gid;
+mod graph;
 mod id;
 mod qos;
 mod text;
@@ -20,6 +21,10 @@ mod topic;
 pub use attachment::{ATTACHMENT_BYTES, Attachment};
 pub use error::{CodecError, Field};
 pub use gid::Gid;
+pub use graph::{
+    ENDPOINT_ID_MAX, ENDPOINT_TOKENS_MAX, EndpointRef, Graph, GraphError, SESSION_TOKENS_MAX, TOKENS_MAX,
+    participant, unassigned_node,
+};
 pub use id::{SGC_MARK, ZenohId};
 pub use qos::{DEPTH_DEFAULT, DEPTH_MAX, decode_qos, encode_qos};
 pub use token::{BACKENDS_BYTES_MAX, BACKENDS_CPU, EntityKind, TOKEN_BYTES_MAX, Token, TokenEndpoint};

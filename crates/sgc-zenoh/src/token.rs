@@ -51,7 +51,7 @@ pub enum EntityKind {
 }
 
 impl EntityKind {
-    const ALL: [Self; 4] = [Self::Publisher, Self::Subscription, Self::Server, Self::Client];
+    pub(crate) const ALL: [Self; 4] = [Self::Publisher, Self::Subscription, Self::Server, Self::Client];
 
     /// Returns the kind as tokens have it.
     fn code(self) -> &'static str {

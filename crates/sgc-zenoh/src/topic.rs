@@ -71,6 +71,11 @@ impl TopicInfo {
         Self::new(name, &type_name, type_hash.ok_or(CodecError::NoTypeHash)?)
     }
 
+    /// Returns the least topic of this name and type in the order of topics.
+    pub(crate) fn least(name: &str, type_name: &str) -> Self {
+        Self { name: name.to_owned(), type_name: type_name.to_owned(), type_hash: String::new() }
+    }
+
     /// Returns the name, with a slash in front: `/chatter`.
     pub fn name(&self) -> &str {
         &self.name

@@ -4,7 +4,7 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::LevelFilter;
 
 /// The log targets: the names of the crates that log.
-const LOG_TARGETS: [&str; 17] = [
+const LOG_TARGETS: [&str; 18] = [
     "sgc",
     "sgc_cdr",
     "sgc_dds",
@@ -22,6 +22,7 @@ const LOG_TARGETS: [&str; 17] = [
     "sgc_trust",
     "sgc_types",
     "sgc_wire",
+    "sgc_zenoh_network",
 ];
 
 /// Reads `LEVEL` and `TARGET=LEVEL`, separated by commas. Refuses a bare word that is no level: the parser would take
@@ -46,8 +47,9 @@ pub(crate) fn log_filter(text: &str) -> Result<EnvFilter, LogFilterError> {
             return Err(LogFilterError::UnknownTarget { written: name.to_owned() });
         }
     }
-    // Strangers can have the ICE agent warn of odd messages. Whoever names it hears it.
-    let quiet = ["is=error"];
+    // Strangers can have the ICE agent warn of odd messages, and Zenoh of a router that is not there, which the node itself
+    // reports. Whoever names them hears it.
+    let quiet = ["is=error", "zenoh=error"];
     EnvFilter::builder()
         .parse(quiet.iter().chain(&directives).copied().collect::<Vec<_>>().join(","))
         .map_err(|error| LogFilterError::Other { reason: error.to_string() })
@@ -104,8 +106,8 @@ mod tests {
             assert!(log_filter(right).is_ok(), "{right}");
         }
         let shown = |text: &str| log_filter(text).map(|filter| filter.to_string());
-        assert_eq!(shown("info"), Ok("is=error,info".to_owned()));
-        assert_eq!(shown("is=debug,warn"), Ok("is=debug,warn".to_owned()));
+        assert_eq!(shown("info"), Ok("zenoh=error,is=error,info".to_owned()));
+        assert_eq!(shown("is=debug,warn"), Ok("zenoh=error,is=debug,warn".to_owned()));
         let level = |written: &str| LogFilterError::Level { written: written.to_owned() };
         let target = |written: &str| LogFilterError::Target { written: written.to_owned() };
         for (wrong, error) in [

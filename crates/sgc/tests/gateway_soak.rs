@@ -10,7 +10,6 @@ mod support;
 
 use std::fs;
 use std::net::SocketAddr;
-use std::str::FromStr;
 use std::time::Duration;
 
 use futures_util::stream::{self, StreamExt as _};
@@ -27,7 +26,7 @@ use tonic::transport::Channel;
 
 use proto::gateway_client::GatewayClient;
 use proto::{publish_request, subscribe_response};
-use support::{PATIENCE, Peer, Running, say};
+use support::{PATIENCE, Peer, Running, environment, say};
 
 /// Number of permanent clients and of visiting clients in the suite's short run.
 const CLIENTS: usize = 100;
@@ -70,10 +69,6 @@ fn gateway_memory_is_bounded_with_many_visits_and_a_client_that_does_not_read() 
         Some(network) => network.within(run).unwrap(),
         None => run(),
     }
-}
-
-fn environment<T: FromStr>(key: &str, default: T) -> T {
-    std::env::var(key).ok().and_then(|text| text.parse().ok()).unwrap_or(default)
 }
 
 /// Waits for a future within the test's patience.

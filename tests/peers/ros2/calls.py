@@ -48,6 +48,7 @@ def serve(options) -> int:
         time.sleep(options.delay)
         served += 1
         response.int64_value = request.int64_value + 1
+        response.string_value = request.string_value
         return response
 
     def execute(goal):

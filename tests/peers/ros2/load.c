@@ -124,6 +124,8 @@ static void fill(std_msgs__msg__UInt8MultiArray *message, uint64_t seq) {
 }
 
 static void make(std_msgs__msg__UInt8MultiArray *message, size_t bytes) {
+    // The function below leaves numbers as they are.
+    memset(message, 0, sizeof *message);
     std_msgs__msg__UInt8MultiArray__init(message);
     rosidl_runtime_c__uint8__Sequence__init(&message->data, bytes);
     for (size_t i = 0; i < bytes; i++) message->data.data[i] = (uint8_t)(i * 167 + (i >> 8));

@@ -4,6 +4,7 @@ import argparse
 import array
 import importlib
 import json
+import pathlib
 import random
 import re
 import signal
@@ -14,6 +15,7 @@ import numpy
 import rclpy
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
 PACKAGES = [
@@ -93,16 +95,53 @@ def fields(of: object, path: str = "") -> dict[str, object]:
     return {path: of.item() if isinstance(of, numpy.generic) else of}
 
 
+def variants(name: str, kind: type) -> list[object]:
+    return [filled(kind, random.Random(f"{name} {variant}")) for variant in range(VARIANTS)]
+
+
+def dump(kinds: dict[str, type]) -> dict:
+    """Returns definitions, type hashes and messages with their bytes, for a program without ROS 2 (../zenoh/values.py)."""
+    definitions, messages = {}, {}
+
+    def define(name: str, kind: type) -> None:
+        if name not in definitions:
+            definitions[name] = kind.get_fields_and_field_types()
+            for spelling in definitions[name].values():
+                if nested := re.search(r"\w+/\w+", spelling):
+                    package, base = nested[0].split("/")
+                    define(nested[0], getattr(importlib.import_module(f"{package}.msg"), base))
+
+    def plain(of: object) -> object:
+        return of[0] if isinstance(of, bytes) else of
+
+    for name, kind in kinds.items():
+        define(name, kind)
+        package, base = name.split("/")
+        described = json.loads((pathlib.Path(sys.prefix) / "share" / package / "msg" / f"{base}.json").read_text())
+        hashes = {one["type_name"]: one["hash_string"] for one in described["type_hashes"]}
+        messages[name] = {
+            "hash": hashes[f"{package}/msg/{base}"],
+            "variants": [
+                {"cdr": serialize_message(one).hex(), "values": {path: plain(of) for path, of in fields(one).items()}}
+                for one in variants(name, kind)
+            ],
+        }
+    return {"definitions": definitions, "messages": messages}
+
+
 def emit(**event: object) -> None:
     print(json.dumps(event), flush=True)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser()
-    parser.add_argument("role", choices=["pub", "sub"])
+    parser.add_argument("role", choices=["pub", "sub", "dump"], help="dump: write to standard output what pub would send")
     parser.add_argument("--namespace", default="/types", help="of the topics")
     parser.add_argument("--timeout", type=float, default=60)
     options = parser.parse_args()
+    if options.role == "dump":
+        print(json.dumps(dump(types())))
+        return 0
     deadline = time.monotonic() + options.timeout
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node("values")
@@ -120,9 +159,6 @@ def main() -> int:
     def is_over() -> bool:
         return bool(ended) or time.monotonic() > deadline
 
-    def variants(name: str) -> list[object]:
-        return [filled(kinds[name], random.Random(f"{name} {variant}")) for variant in range(VARIANTS)]
-
     if options.role == "pub":
         publishers = {}
         for name, kind in kinds.items():
@@ -135,7 +171,7 @@ def main() -> int:
         sys.stdin.readline()
         for variant in range(VARIANTS):
             for name, publisher in publishers.items():
-                publisher.publish(variants(name)[variant])
+                publisher.publish(variants(name, kinds[name])[variant])
             if variant == 0:
                 time.sleep(PAUSE_S)
         emit(event="all_sent")
@@ -143,7 +179,7 @@ def main() -> int:
             rclpy.spin_once(node, timeout_sec=0.1)
         return 0
 
-    expected = {name: [fields(message) for message in variants(name)] for name in kinds}
+    expected = {name: [fields(message) for message in variants(name, kind)] for name, kind in kinds.items()}
     heard = {name: [] for name in kinds}
     altered = []
 

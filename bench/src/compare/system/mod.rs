@@ -2,6 +2,7 @@
 
 mod direct;
 mod relay;
+pub(crate) mod rmw_zenoh;
 mod security;
 mod sgc;
 pub(crate) mod wireguard;
@@ -13,7 +14,7 @@ use anyhow::Result;
 use clap::Args;
 use serde_json::Value;
 
-pub(crate) use sgc::Sgc;
+pub(crate) use sgc::{Middleware, Sgc};
 
 pub(crate) use super::networks::{Dds, Networks, Running};
 
@@ -49,6 +50,9 @@ pub(crate) struct Peers {
     /// The program that talks and listens, built with its feature `dds-security`
     #[arg(long, value_name = "FILE", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/target/dds-security/release/load"))]
     secure_load: PathBuf,
+    /// The program that talks and listens, built with its feature `zenoh`
+    #[arg(long, value_name = "FILE", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/target/zenoh/release/load"))]
+    zenoh_load: PathBuf,
     /// The environments of ROS 2, of scripts/build-ros2.sh
     #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/../.peers"))]
     pub(super) ros2: PathBuf,
@@ -94,6 +98,34 @@ pub(crate) fn configured(
     }
     Ok(systems)
 }
+
+/// Returns the systems with programs of rmw_zenoh, and `sgc` with the same settings between DDS networks. `sgc` has one
+/// router, as between sites, and these priorities.
+pub(crate) fn with_rmw_zenoh(
+    sgc: &Path,
+    peers: &Peers,
+    priorities: &'static [(&'static str, &'static str)],
+) -> Result<Vec<Box<dyn System>>> {
+    use Middleware::{Dds, Zenoh};
+    let load = &peers.zenoh_load;
+    let mut systems: Vec<Box<dyn System>> =
+        rmw_zenoh::ALL.map(|routers| Box::new(rmw_zenoh::RmwZenoh::new(load, routers)) as _).into();
+    for middleware in [[Zenoh, Zenoh], [Dds, Zenoh], [Dds, Dds]] {
+        let one = Sgc::new(sgc, "quic", "pairwise", 1)?.with_priorities(priorities);
+        systems.push(Box::new(one.between(middleware, load)));
+    }
+    Ok(systems)
+}
+
+/// The names of [`with_rmw_zenoh`].
+pub(crate) const WITH_RMW_ZENOH: [&str; 6] = [
+    "rmw-zenoh-one-host",
+    "rmw-zenoh-one-router",
+    "rmw-zenoh-two-routers",
+    "sgc-zenoh-zenoh",
+    "sgc-dds-zenoh",
+    "sgc-dds-dds",
+];
 
 /// The reason why rosbridge is not compared: it carries only types that are installed as ROS 2 packages beside it, and
 /// the programs here have a type of their own.

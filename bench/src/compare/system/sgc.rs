@@ -6,8 +6,10 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
+use super::rmw_zenoh::start_router;
 use super::{Dds, Running, System, Topic};
 use crate::compare::lab::{Lab, Side};
+use crate::compare::networks::ZENOH_OVERRIDES;
 use crate::compare::program::Program;
 use crate::fleet::BenchFleet;
 
@@ -24,6 +26,25 @@ pub(crate) struct Sgc {
     routers: usize,
     /// Topics whose `priority` is not the default one.
     priorities: &'static [(&'static str, &'static str)],
+    /// The middleware of the left and of the right place, and the load program for Zenoh, if that is what is compared.
+    middleware: Option<([Middleware; 2], PathBuf)>,
+}
+
+/// The middleware of a place's programs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Middleware {
+    Dds,
+    /// rmw_zenoh, with a router of its own.
+    Zenoh,
+}
+
+impl Middleware {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Dds => "dds",
+            Self::Zenoh => "zenoh",
+        }
+    }
 }
 
 /// Every transport with each of three suites, and the default transport with the default suite, and with a router
@@ -46,7 +67,26 @@ impl Sgc {
     ) -> Result<Self> {
         let program = program.canonicalize();
         let program = program.with_context(|| "the program that is measured: is it built?")?;
-        Ok(Self { program, scheme, suite, routers, priorities: &[] })
+        Ok(Self { program, scheme, suite, routers, priorities: &[], middleware: None })
+    }
+
+    /// Between places with these middlewares; named after them.
+    pub(crate) fn between(self, middleware: [Middleware; 2], zenoh_load: &Path) -> Self {
+        Self { middleware: Some((middleware, zenoh_load.to_owned())), ..self }
+    }
+
+    /// Returns the network of a place, and starts what that needs.
+    fn network(&self, lab: &Lab, side: Side, running: &mut Running) -> Result<Dds> {
+        let Some((_, load)) = self.middleware.as_ref().filter(|_| self.is_on_zenoh(side)) else {
+            return Ok(lab.networks.local(side));
+        };
+        let load = load.canonicalize().with_context(|| format!("{}: is it built?", load.display()))?;
+        running.processes.push((side, start_router(lab, side, &load, "")?));
+        Ok(Dds::zenoh(load))
+    }
+
+    fn is_on_zenoh(&self, side: Side) -> bool {
+        self.middleware.as_ref().is_some_and(|(both, _)| both[side as usize] == Middleware::Zenoh)
     }
 
     /// With priorities for some topics, instead of the default one.
@@ -64,7 +104,9 @@ impl Sgc {
         let mut command = lab.command(side, &self.program);
         command.args(["run", "--print-ready", "--until-stdin-closes", "--log", "warn", "--config"]);
         // Variables of a user's shell must not affect the measurement.
-        for variable in ["CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "SGC_LOG"] {
+        for variable in
+            ["CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "SGC_LOG", ZENOH_OVERRIDES]
+        {
             command.env_remove(variable);
         }
         let mut program = Program::start(
@@ -126,6 +168,9 @@ fn ros(dds: &Dds) -> String {
 
 impl System for Sgc {
     fn name(&self) -> String {
+        if let Some(([left, right], _)) = &self.middleware {
+            return format!("sgc-{}-{}", left.name(), right.name());
+        }
         let router = match self.routers {
             0 => String::new(),
             1 => "-router".into(),
@@ -139,6 +184,9 @@ impl System for Sgc {
         let fleet = BenchFleet::new()?;
         let dds = Side::BOTH.map(|side| lab.networks.local(side));
         let mut running = Running { processes: Vec::new(), dds };
+        for side in Side::BOTH {
+            running.dds[side as usize] = self.network(lab, side, &mut running)?;
+        }
         // Numbered from the right; each dials the one before.
         for number in 0..self.routers {
             let node = format!("router-{number}");
@@ -164,7 +212,10 @@ impl System for Sgc {
                 (Side::Left, routers) => self.url(lab.address(Side::Right), routers.saturating_sub(1)),
             };
             let mut text = format!("[node]\nstate = \"{node}.state\"\nrouters = [{dials}]\n");
-            text += &ros(&running.dds[side as usize]);
+            text += &match self.is_on_zenoh(side) {
+                true => "[ros]\nmiddleware = \"zenoh\"\ndomain_id = 0\n".to_owned(),
+                false => ros(&running.dds[side as usize]),
+            };
             if listens {
                 writeln!(text, "[router]\nlisten = [{}]", self.url("0.0.0.0", 0))?;
             }

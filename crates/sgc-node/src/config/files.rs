@@ -22,6 +22,9 @@ pub(crate) const PEM_BYTES_MAX: u64 = 256 * 1024;
 /// Largest file of a password, bytes: more than any password has.
 const PASSWORD_FILE_BYTES_MAX: u64 = 4096;
 
+/// Largest session configuration of Zenoh, bytes: 20 times that of rmw_zenoh.
+const ZENOH_CONFIG_BYTES_MAX: u64 = 1024 * 1024;
+
 /// The checks of [`super::load`].
 pub(super) const FILES: FileChecks = FileChecks {
     identity: check_identity,
@@ -33,6 +36,7 @@ pub(super) const FILES: FileChecks = FileChecks {
     roots: check_roots,
     headers: check_headers,
     password: check_password,
+    zenoh: check_zenoh,
     directory: check_directory,
 };
 
@@ -127,6 +131,23 @@ fn check_password(key: &'static str, path: &Path) -> Result<(), Mistake> {
         Err(error) => error.to_string(),
     };
     let expected = "a file with nothing but the password of the store's user";
+    Err(Mistake::File { key, path: path.to_owned(), reason, expected })
+}
+
+fn check_zenoh(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    let read = fs::File::open(path).and_then(|file| {
+        let mut text = String::new();
+        file.take(ZENOH_CONFIG_BYTES_MAX + 1).read_to_string(&mut text).map(|_| text)
+    });
+    let reason = match read {
+        Ok(text) if text.len() as u64 > ZENOH_CONFIG_BYTES_MAX => {
+            format!("it has more than {ZENOH_CONFIG_BYTES_MAX} bytes")
+        }
+        Ok(text) if text.trim().is_empty() => "it is empty".to_owned(),
+        Ok(_) => return Ok(()),
+        Err(error) => error.to_string(),
+    };
+    let expected = "a session configuration of Zenoh, such as rmw_zenoh's, that this user may read";
     Err(Mistake::File { key, path: path.to_owned(), reason, expected })
 }
 

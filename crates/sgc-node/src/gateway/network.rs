@@ -11,9 +11,9 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use sgc_gateway::{LocalReader, LocalRos};
 use sgc_ros::{
-    DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointSpec, GraphNode, Guid, HandleCalls,
-    HandleSamples, Reach, RequestHandler, RequestId, RosClient, RosError, RosServer, RosWriter, Sample,
-    SampleHandler, SampleHead, SentRequest, ServiceSpec, UnhandledCall,
+    DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointSpec, GraphNode, Guid, HandleCalls, Reach,
+    RequestHandler, RequestId, RosClient, RosError, RosServer, RosWriter, SampleHandler, SampleHead,
+    SentRequest, ServiceSpec, SharedSamples, UnhandledCall,
 };
 use sgc_sync::lock;
 use sgc_wire::History;
@@ -272,8 +272,8 @@ impl LocalRos for HubNetwork {
     }
 
     fn reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<LocalReader, RosError> {
-        let reader =
-            Reader { spec: spec.clone(), handler: Arc::new(Mutex::new(handler)), present: Mutex::default() };
+        let handler = SharedSamples::new(handler);
+        let reader = Reader { spec: spec.clone(), handler, present: Mutex::default() };
         let registered = self.0.register(reader)?;
         let guid = registered.endpoint.first();
         Ok(LocalReader::new(guid, ReaderHandle(registered)))
@@ -359,7 +359,8 @@ impl<T, const N: usize> Present<T, N> {
 
 struct Reader {
     spec: EndpointSpec,
-    handler: Arc<Mutex<SampleHandler>>,
+    /// The next reader has it as well.
+    handler: SharedSamples,
     present: Mutex<Present<LocalReader, 1>>,
 }
 
@@ -376,7 +377,7 @@ impl Endpoint for Reader {
     }
 
     fn open(&self, network: &dyn LocalRos) -> Result<(), RosError> {
-        let reader = network.reader(&self.spec, Box::new(SharedSamples(Arc::clone(&self.handler))))?;
+        let reader = network.reader(&self.spec, Box::new(self.handler.clone()))?;
         let guid = reader.guid();
         lock(&self.present).set(reader, [guid]);
         Ok(())
@@ -393,27 +394,6 @@ struct ReaderHandle(Registered<Reader>);
 impl Drop for ReaderHandle {
     fn drop(&mut self) {
         drop(self.0.endpoint.close());
-    }
-}
-
-/// The handler of a reader's samples, which the next reader has as well.
-struct SharedSamples(Arc<Mutex<SampleHandler>>);
-
-impl HandleSamples for SharedSamples {
-    fn handle(&mut self, sample: Sample) {
-        lock(&self.0).handle(sample);
-    }
-
-    fn handle_at_once(&mut self, sample: Sample) -> Option<Sample> {
-        // A reader that ends may still hold it.
-        match self.0.try_lock() {
-            Ok(mut handler) => handler.handle_at_once(sample),
-            Err(_) => Some(sample),
-        }
-    }
-
-    fn overrun(&mut self, samples: u64) {
-        lock(&self.0).overrun(samples);
     }
 }
 
@@ -677,7 +657,7 @@ mod tests {
         Advertise, Client as HubClient, Content, Form, GatewayError, Hub, HubOptions, Session, SessionLimits,
         ShippedDefinitions, Subscribe, Types,
     };
-    use sgc_ros::{REDISCOVERY_HOLD, RosNetwork, SampleKind, dds_topic, dds_type};
+    use sgc_ros::{REDISCOVERY_HOLD, RosNetwork, Sample, SampleKind, dds_topic, dds_type};
     use sgc_testkit::{FakeDomain, FakeRos};
     use sgc_wire::{Durability, Qos};
 

@@ -30,7 +30,7 @@ impl HostAddress {
             (IpAddr::V6(own), IpAddr::V6(other)) => (own.to_bits() ^ other.to_bits()).leading_zeros(),
             _ => return false,
         };
-        shared >= self.prefix.into()
+        shared >= u32::from(self.prefix)
     }
 }
 

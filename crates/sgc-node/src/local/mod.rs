@@ -2,8 +2,12 @@
 
 pub(crate) mod dds_discovery;
 pub mod discovery_server;
+#[cfg(any(feature = "zenoh", test))]
+pub(crate) mod joined;
+pub(crate) mod middleware;
 pub(crate) mod network_slot;
 pub(crate) mod network_state;
 pub(crate) mod rediscovery;
 pub(crate) mod reopening;
 pub(crate) mod strangers;
+pub(crate) mod zenoh;

@@ -6,18 +6,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_config::{DiscoveryRange, RosConfig, SecurityConfig};
-use sgc_dds::{CycloneNetwork, DdsConfig, Security};
+use sgc_dds::{DdsConfig, Security};
 use sgc_gateway::LocalRos;
 use sgc_ros::{RosError, RosNetwork, Routes, ShareRule, UseRule};
 use sgc_trust::Identity;
+use sgc_types::TypeStore;
 use tokio::sync::mpsc;
 use tracing::warn;
 
 use crate::control::event::CoreEvent;
 use crate::gateway::{Gateway, OpenLocalRos};
 use crate::local::dds_discovery::discover;
+use crate::local::middleware::{LocalNetwork, open_both};
 use crate::local::network_slot::{JoinNetwork, NetworkSlot, OpenAgain};
-use crate::local::{discovery_server, strangers};
+use crate::local::{discovery_server, strangers, zenoh};
 use crate::node::error::NodeError;
 use crate::node::random::system_rng;
 
@@ -25,21 +27,28 @@ use crate::node::random::system_rng;
 pub type OpenNetwork<N> =
     Arc<dyn Fn(&RosConfig) -> Result<(Arc<N>, Option<OpenLocalRos>), RosError> + Send + Sync>;
 
-/// Returns a function that opens Cyclone DDS with the settings of a configuration, under the name of this identity.
-pub(super) fn open_cyclone(identity: Arc<Identity>) -> OpenNetwork<CycloneNetwork> {
+/// Returns a function that opens the networks of a configuration, under the name of this identity. `types` has the types
+/// that the node knows.
+pub(super) fn open_local(identity: Arc<Identity>, types: Arc<TypeStore>) -> OpenNetwork<LocalNetwork> {
     let runtime = tokio::runtime::Handle::current();
     let is_watched = AtomicBool::new(false);
     Arc::new(move |ros| {
-        let config = dds_config(ros, &identity);
-        // The gateway is an ordinary participant. The node's own participant sees its topics like any program's.
-        let of_gateway = DdsConfig { tag: None, ..config.clone() };
+        let dds = ros.middleware.has_dds().then(|| dds_config(ros, &identity));
+        let zenoh = zenoh::config(ros, &types);
+        // The gateway is an ordinary program. The node's own participant sees its topics like any program's.
+        let of_gateway =
+            (dds.clone().map(|dds| DdsConfig { tag: None, ..dds }), zenoh.clone().map(zenoh::of_program));
         let gateway: OpenLocalRos = Arc::new(move || {
-            CycloneNetwork::open(&of_gateway).map(|network| Arc::new(network) as Arc<dyn LocalRos>)
+            let (dds, zenoh) = &of_gateway;
+            open_both(dds.as_ref(), zenoh.as_ref()).map(|network| Arc::new(network) as Arc<dyn LocalRos>)
         });
-        let network = Arc::new(CycloneNetwork::open(&config)?);
-        if !is_watched.swap(true, Ordering::Relaxed) {
+        let network = Arc::new(open_both(dds.as_ref(), zenoh.as_ref())?);
+        if dds.is_some() && !is_watched.swap(true, Ordering::Relaxed) {
             runtime.spawn(discovery_server::watch());
             runtime.spawn(strangers::watch());
+        }
+        if ros.middleware.has_zenoh() {
+            runtime.spawn(zenoh::watch(Arc::downgrade(&network), ros.zenoh.router_check));
         }
         Ok((network, Some(gateway)))
     })

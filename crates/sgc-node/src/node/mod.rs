@@ -48,7 +48,7 @@ pub fn expiry_warning(identity: &Identity, at: UnixMillis) -> Option<String> {
 /// Runs a node until `shutdown` is ready. Then it withdraws its names, drains its queues and returns.
 pub async fn run(
     config: Config,
-    options: RunOptions,
+    mut options: RunOptions,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
     let identity = Arc::new(check_startable(&config)?);
@@ -57,7 +57,8 @@ pub async fn run(
     } else if let Some(warning) = expiry_warning(&identity, now().unix) {
         warn!("{warning}");
     }
-    let open = local::open_cyclone(identity.clone());
+    let types = options.types.get_or_insert_default().clone();
+    let open = local::open_local(identity.clone(), types);
     run_opening(config, identity, open, options, shutdown).await
 }
 

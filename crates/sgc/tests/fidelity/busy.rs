@@ -8,8 +8,8 @@ use std::fs;
 use std::time::{Duration, Instant};
 
 use crate::lab::{Lab, Site};
-use crate::support::{eventually, say};
-use crate::{EXCLUSIVE, environment, python};
+use crate::support::{environment, eventually, say};
+use crate::{EXCLUSIVE, python};
 
 const NODES: u64 = 20;
 const SHARED: u64 = 10;

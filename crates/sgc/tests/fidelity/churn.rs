@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 use serde_json::Value;
 
+use crate::PLAN;
 use crate::lab::{Lab, SITES, Site, robot_to_desk, share, uses};
 use crate::observer::Observer;
-use crate::support::{PATIENCE, Peer, eventually, say};
-use crate::{PLAN, environment};
+use crate::support::{PATIENCE, Peer, environment, eventually, say};
 
 const SEED: u64 = 6;
-const STEPS: u32 = 20;
+const STEPS: u64 = 20;
 /// Bound of the memory that a node may hold beyond that after its start.
 const RESIDENT_MORE_KB_MAX: u64 = 40_000;
 const FDS_MORE_MAX: usize = 12;
@@ -168,7 +168,7 @@ fn assert_flows(apps: &mut [App]) {
 #[test]
 fn nothing_is_left_of_what_came_and_went() {
     let seed = environment("SGC_CHURN_SEED", SEED);
-    let steps = environment("SGC_CHURN_STEPS", STEPS.into());
+    let steps = environment("SGC_CHURN_STEPS", STEPS);
     let mut rng = Rng(seed);
     let [mut robot, mut desk] = robot_to_desk("topic", ["/string", "/latched"]);
     robot += &uses("topic", "/command", "desk");

@@ -29,8 +29,3 @@ const EXCLUSIVE: Plan = Plan { turn: TurnKind::Exclusive, ..PLAN };
 fn python(lab: &Lab, site: Site, program: &str, args: &[&str]) -> Peer {
     lab.python(site, program, &[&[lab.domain(site)], args].concat())
 }
-
-/// Reads a number from the environment, for longer runs.
-fn environment(key: &str, otherwise: u64) -> u64 {
-    std::env::var(key).ok().and_then(|v| v.parse().ok()).unwrap_or(otherwise)
-}

@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 
+use crate::EXCLUSIVE;
 use crate::lab::{Lab, SITES, Site};
-use crate::support::{PATIENCE, Peer, say};
-use crate::{EXCLUSIVE, environment};
+use crate::support::{PATIENCE, Peer, environment, say};
 
 const SECONDS: u64 = 6;
 const NODE_SECONDS_MAX: u64 = 8;

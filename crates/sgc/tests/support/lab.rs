@@ -126,8 +126,18 @@ impl Lab {
 
     /// Starts a node in the network of another.
     pub(crate) fn start_at(&mut self, node: Site, site: Site) {
-        let mut command = self.sgc(Some(site), &["run", "-c"]);
-        command.arg(self.path(node, "toml"));
+        self.start_with(node, self.sgc(Some(site), &[]));
+    }
+
+    /// Starts a node with variables in its environment.
+    pub(crate) fn start_within(&mut self, site: Site, environment: &[(&str, &str)]) {
+        let mut command = self.sgc(Some(site), &[]);
+        command.envs(environment.iter().copied());
+        self.start_with(site, command);
+    }
+
+    fn start_with(&mut self, node: Site, mut command: Command) {
+        command.args(["run", "-c"]).arg(self.path(node, "toml"));
         self.nodes[node as usize] = Some(Running::start(command, &self.path(node, "log")));
     }
 

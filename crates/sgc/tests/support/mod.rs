@@ -9,6 +9,7 @@ use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::str::FromStr;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
@@ -56,6 +57,11 @@ pub(crate) fn remove_abandoned(prefix: &str) {
             let _ = netsim::ip(&["netns", "delete", name]);
         }
     }
+}
+
+/// Returns a value from the environment, for longer or other runs, or this one if there is none.
+pub(crate) fn environment<T: FromStr>(key: &str, default: T) -> T {
+    std::env::var(key).ok().and_then(|text| text.parse().ok()).unwrap_or(default)
 }
 
 /// Returns the path of a file of this repository.

@@ -149,6 +149,8 @@ impl<N: RosNetwork> Core<N> {
         }));
         let closed = self.reopening.failure().map(str::to_owned);
         alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
+        let router = self.network.get().and_then(|network| network.missing_router());
+        alerts.extend(router.map(|router| Alert::ZenohRouterMissing { router }));
         alerts.extend(self.storage.alert().into_iter().chain(self.audit.alert()));
         if let Some(store) = self.router.store_stats() {
             let ago_s = |at: Instant| now.instant.saturating_duration_since(at).as_secs();

@@ -97,6 +97,11 @@ pub enum Alert {
         /// The reason.
         reason: String,
     },
+    /// The router of the local Zenoh network is not connected, so programs and this node do not find each other.
+    ZenohRouterMissing {
+        /// The endpoint of the router.
+        router: String,
+    },
     /// DDS Security protects programs of the local ROS 2 network, and this node has no enclave.
     ProtectedPrograms {
         /// The enclave that they name, `/` if they have none of their own.
@@ -225,6 +230,10 @@ impl Alert {
                 "see whether an interface or address that CYCLONEDDS_URI or ROS_STATIC_PEERS names is gone; the node tries again by itself, \
                  up to a minute apart"
             }
+            Self::ZenohRouterMissing { .. } => {
+                "start the router (`ros2 run rmw_zenoh_cpp rmw_zenohd`), or name the one that the programs use with `router` in [ros.zenoh]. \
+                 The node connects by itself as soon as it is there"
+            }
             Self::ProtectedPrograms { .. } => {
                 "set `security_root` in [ros] to their keystore and `enclave` to one of its enclaves (docs/how-to/sros2.md)"
             }
@@ -331,6 +340,11 @@ impl fmt::Display for Alert {
             Self::LocalNetworkClosed { reason } => {
                 write!(f, "the local ROS 2 network is closed and cannot be opened again: {reason}")
             }
+            Self::ZenohRouterMissing { router } => write!(
+                f,
+                "the Zenoh router {router} of the local ROS 2 network is not connected: programs of rmw_zenoh and this node find each \
+                 other through it"
+            ),
             Self::ProtectedPrograms { enclave } => write!(
                 f,
                 "a program of enclave {enclave} announces itself to sgc, but none of its topics: DDS Security (SROS2) protects it, and \
