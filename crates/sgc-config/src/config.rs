@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use sgc_ros::{Interface, Naming, QosOverride, Shaping};
+use sgc_ros::{Interface, Naming, QosOverride, Resume, Shaping};
 use sgc_router::MappingKind;
 use sgc_store::{StorePrefix, StoreServer};
 use sgc_transport::{Congestion, ListenAddr};
@@ -21,6 +21,11 @@ use crate::zenoh::{Middleware, ZenohConfig};
 pub const KEEP_ALIVE_MIN: Duration = Duration::from_secs(1);
 /// The longest configurable time between probes of a link.
 pub const KEEP_ALIVE_MAX: Duration = Duration::from_secs(60);
+
+/// The shortest configurable time of a dead-man switch.
+pub const DEAD_MAN_MIN: Duration = Duration::from_millis(20);
+/// The longest configurable time of a dead-man switch.
+pub const DEAD_MAN_MAX: Duration = Duration::from_secs(60);
 
 /// The lowest rate of a peer, in bits a second. Below it, a large message takes minutes.
 pub const PEER_RATE_MIN: u64 = 64_000;
@@ -289,6 +294,8 @@ pub struct UseConfig {
     pub naming: Naming,
     /// Prefix of frame names in tf messages.
     pub frame_prefix: Option<String>,
+    /// Dead-man switch of a topic that comes here.
+    pub dead_man: Option<DeadManConfig>,
     /// `pkg/msg/Name`, if the user insists on a type; otherwise the owner's catalogue decides.
     pub type_name: Option<String>,
     /// Whether this node publishes on the topic instead of receiving it.
@@ -312,10 +319,36 @@ pub struct TokenConfig {
     pub naming: Naming,
     /// Prefix of frame names in tf messages.
     pub frame_prefix: Option<String>,
+    /// Dead-man switch.
+    pub dead_man: Option<DeadManConfig>,
     /// Local QoS policies that replace those of the far publishers.
     pub qos: QosOverride,
     /// Whether the topic has a lane to the next node.
     pub dedicated: bool,
+}
+
+/// The dead-man switch of a topic of commands.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DeadManConfig {
+    /// Longest time without a command, and most by which one may be late: [`DEAD_MAN_MIN`] to [`DEAD_MAN_MAX`].
+    pub after: Duration,
+    /// The stop message.
+    pub stop: StopSource,
+    /// Time after which the stop message is published again, within the same bounds; `None` for once.
+    pub repeat: Option<Duration>,
+    /// The end of a stop.
+    pub resume: Resume,
+}
+
+/// Source of a stop message.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum StopSource {
+    /// The message with every field zero or empty.
+    Zero,
+    /// The last command that passed.
+    Last,
+    /// A JSON file.
+    File(PathBuf),
 }
 
 /// Source of a token.

@@ -204,7 +204,18 @@ pub(crate) struct UseDraft {
     pub(crate) qos: QosDraft,
     pub(crate) naming: NamingDraft,
     pub(crate) frame_prefix: Option<WithOrigin<String>>,
+    pub(crate) dead_man: Option<DeadManDraft>,
     pub(crate) link: Option<WithOrigin<String>>,
+}
+
+/// `[use.deadman]`. Required fields are `None` only if an error was recorded.
+#[derive(Debug)]
+pub(crate) struct DeadManDraft {
+    pub(crate) origin: Origin,
+    pub(crate) after: Option<WithOrigin<String>>,
+    pub(crate) publish: Option<WithOrigin<String>>,
+    pub(crate) repeat: Option<WithOrigin<String>>,
+    pub(crate) resume: Option<WithOrigin<String>>,
 }
 
 /// `[rotation]`.

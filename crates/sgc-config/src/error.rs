@@ -1006,7 +1006,15 @@ pub enum Mistake {
         /// The key.
         key: &'static str,
     },
-    /// A frame prefix for a topic that leaves this network.
+    /// A dead-man switch of several topics.
+    #[error("`{key}` is for one topic, and {topic:?} may match several: name the topic of commands")]
+    DeadManOfMany {
+        /// The key.
+        key: &'static str,
+        /// The pattern.
+        topic: String,
+    },
+    /// A frame prefix, or another setting of what comes here, for a topic that leaves this network.
     #[error("`{key}` is for what comes here: take it out, or `publish`")]
     FramesElsewhere {
         /// The key.

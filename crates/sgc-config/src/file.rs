@@ -12,9 +12,9 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use crate::draft::{
-    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft,
-    RosDraft, RotationDraft, ShapingDraft, ShareDraft, StoreDraft, TransportDraft, UseDraft, WithOrigin,
-    Words, ZenohDraft,
+    AuditDraft, DeadManDraft, Draft, GatewayClientDraft, GatewayDraft, MetricsDraft, NamingDraft,
+    PartnerDraft, QosDraft, RosDraft, RotationDraft, ShapingDraft, ShareDraft, StoreDraft, TransportDraft,
+    UseDraft, WithOrigin, Words, ZenohDraft,
 };
 use crate::error::{ConfigError, Mistake, Origin};
 use crate::schema::{Table, nearest};
@@ -262,6 +262,7 @@ impl FileReader<'_> {
             self.check_required(one, "from", "\"arm-1\"");
             self.check_required(one, "topic", "\"/camera/image\"");
         }
+        let dead_man = self.single(one, "use.deadman", Table::UseDeadMan).map(|table| self.dead_man(&table));
         let one = Some(one);
         UseDraft {
             token: self.string(one, "token", "a string, such as \"arm-1-pose.token\""),
@@ -274,7 +275,22 @@ impl FileReader<'_> {
             qos: self.qos(one),
             naming: self.naming(one),
             frame_prefix: self.string(one, "frame_prefix", "a string, such as \"robot1/\""),
+            dead_man,
             link: self.string(one, "link", "a string, \"shared\" or \"dedicated\""),
+        }
+    }
+
+    fn dead_man(&mut self, table: &Section<'_, '_>) -> DeadManDraft {
+        self.check_required(table, "after", "\"300ms\"");
+        self.check_required(table, "publish", "\"zero\"");
+        let origin = self.origin(table.span.clone());
+        let table = Some(table);
+        DeadManDraft {
+            origin,
+            after: self.string(table, "after", "a string, such as \"300ms\""),
+            publish: self.string(table, "publish", "a string, \"zero\", \"last\" or the path of a JSON file"),
+            repeat: self.string(table, "repeat", "a string, such as \"100ms\""),
+            resume: self.string(table, "resume", "a string, \"auto\" or \"manual\""),
         }
     }
 

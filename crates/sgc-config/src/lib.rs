@@ -28,9 +28,10 @@ use std::path::Path;
 
 pub use args::ArgsConfig;
 pub use config::{
-    AuditConfig, AuditRoom, AuthorityConfig, Config, DiscoveryRange, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN,
-    PEER_RATE_MAX, PEER_RATE_MIN, PartnerConfig, RosConfig, RotationConfig, SecurityConfig, ShareConfig,
-    ShareMetadata, StoreSettings, TokenConfig, TokenSource, TransportConfig, UseConfig,
+    AuditConfig, AuditRoom, AuthorityConfig, Config, DEAD_MAN_MAX, DEAD_MAN_MIN, DeadManConfig,
+    DiscoveryRange, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PEER_RATE_MAX, PEER_RATE_MIN, PartnerConfig, RosConfig,
+    RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, StopSource, StoreSettings, TokenConfig,
+    TokenSource, TransportConfig, UseConfig,
 };
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule, ZenohOverrideFault};
 pub use gateway::{
@@ -47,7 +48,7 @@ pub use resolve::{
 pub use ros_env::{DOMAIN_ID_MAX, Environment, STATIC_PEERS_MAX};
 pub use router_url::{RouterUrl, RouterUrlError, SRV_SERVICE, SrvDomain, WAYS_MAX};
 pub use schema::{Table, nearest};
-pub use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping, TOPIC_BYTES_MAX};
+pub use sgc_ros::{Interface, Naming, QosOverride, Rename, Resume, Shaping, TOPIC_BYTES_MAX};
 pub use units::{parse_duration, parse_rate};
 pub use zenoh::{
     Middleware, RouterCheck, ZENOH_OVERRIDE_KEY_BYTES_MAX, ZENOH_OVERRIDE_VALUE_BYTES_MAX,

@@ -4,6 +4,7 @@
 //! how it relates to other settings.
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use sgc_gateway::{PageOrigin, PageOriginError};
@@ -13,7 +14,7 @@ use sgc_transport::{ListenAddr, UrlError};
 use sgc_trust::{CertificateName, FleetName, LABEL_BYTES_MAX, NodeName};
 use sgc_wire::NodeId;
 
-use crate::config::{PEER_RATE_MAX, PEER_RATE_MIN};
+use crate::config::{DEAD_MAN_MAX, DEAD_MAN_MIN, PEER_RATE_MAX, PEER_RATE_MIN};
 use crate::error::{Mistake, TopicRule};
 use crate::gateway::GatewayUrl;
 use crate::metrics::{OtlpUrl, OtlpUrlError};
@@ -262,13 +263,24 @@ pub(crate) fn bandwidth(key: &'static str, value: &str) -> Result<u64, Mistake> 
 /// Checks the greatest age of messages.
 pub(crate) fn age(key: &'static str, value: &str) -> Result<Duration, Mistake> {
     const WHAT: &str = "a length of time, \"1ms\" to \"1h\": \"500ms\", \"2s\"";
+    let bounds = Duration::from_millis(1)..=Duration::from_secs(3600);
+    millis_within(value, bounds).ok_or_else(|| shaping_mistake(key, value, WHAT))
+}
+
+/// Checks a time of a dead-man switch.
+pub(crate) fn dead_man_time(key: &'static str, value: &str) -> Result<Duration, Mistake> {
+    const WHAT: &str = "a length of time, \"20ms\" to \"60s\": \"300ms\", \"1s\"";
+    millis_within(value, DEAD_MAN_MIN..=DEAD_MAN_MAX).ok_or_else(|| shaping_mistake(key, value, WHAT))
+}
+
+/// Parses a length of time in milliseconds or longer units.
+fn millis_within(value: &str, bounds: RangeInclusive<Duration>) -> Option<Duration> {
     let millis = |text: &str| {
         let digits = Some(text.trim_end()).filter(|t| t.bytes().all(|b| b.is_ascii_digit()));
         digits?.parse().ok().map(Duration::from_millis)
     };
-    let age = value.strip_suffix("ms").map_or_else(|| parse_duration(value), millis);
-    let bounds = Duration::from_millis(1)..=Duration::from_secs(3600);
-    age.filter(|age| bounds.contains(age)).ok_or_else(|| shaping_mistake(key, value, WHAT))
+    let time = value.strip_suffix("ms").map_or_else(|| parse_duration(value), millis);
+    time.filter(|time| bounds.contains(time))
 }
 
 fn shaping_mistake(key: &'static str, value: &str, what: &'static str) -> Mistake {

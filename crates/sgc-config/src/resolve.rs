@@ -8,7 +8,7 @@ mod zenoh_table;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping, is_enclave, is_pattern, matches};
+use sgc_ros::{Interface, Naming, QosOverride, Rename, Resume, Shaping, is_enclave, is_pattern, matches};
 use sgc_router::MappingKind;
 use sgc_store::{SERVERS_MAX, StoreServer};
 use sgc_transport::Congestion;
@@ -18,13 +18,13 @@ use sgc_wire::{
 };
 
 use crate::config::{
-    AuditConfig, AuditRoom, AuthorityConfig, Config, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig,
-    RosConfig, RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, StoreSettings, TokenConfig,
-    TokenSource, TransportConfig, UseConfig,
+    AuditConfig, AuditRoom, AuthorityConfig, Config, DeadManConfig, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN,
+    PartnerConfig, RosConfig, RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, StopSource,
+    StoreSettings, TokenConfig, TokenSource, TransportConfig, UseConfig,
 };
 use crate::draft::{
-    Draft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, StoreDraft,
-    UseDraft, WithOrigin, Words,
+    DeadManDraft, Draft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft,
+    ShareDraft, StoreDraft, UseDraft, WithOrigin, Words,
 };
 use crate::error::{ConfigError, Mistake, Origin};
 use crate::metrics::{MetricsConfig, OtlpConfig};
@@ -844,6 +844,7 @@ impl Resolver<'_> {
             let unnamed = NamingDraft { except: None, ..one.naming.clone() };
             let naming = self.naming(&unnamed, Some("/topic")).unwrap_or_default();
             let frame_prefix = self.frame_prefix(one);
+            let dead_man = one.dead_man.as_ref().and_then(|written| self.dead_man(written));
             let Some(source) = self.token(written) else { continue };
             if let Some((_, other)) = first.iter().find(|(known, _)| known.source == source) {
                 let other = other.reference();
@@ -851,7 +852,7 @@ impl Resolver<'_> {
             } else {
                 let dedicated = self.dedicated(one.link.as_ref());
                 let qos = self.qos(&one.qos);
-                first.push((TokenConfig { source, naming, frame_prefix, qos, dedicated }, written));
+                first.push((TokenConfig { source, naming, frame_prefix, dead_man, qos, dedicated }, written));
             }
         }
         first.into_iter().map(|(token, _)| token).collect()
@@ -960,12 +961,26 @@ impl Resolver<'_> {
             self.record(&written.origin, Mistake::FramesElsewhere { key: written.key });
         }
         let frame_prefix = self.frame_prefix(one);
+        let dead_man = one.dead_man.as_ref().and_then(|written| {
+            const KEY: &str = "deadman";
+            if publish {
+                self.record(&written.origin, Mistake::FramesElsewhere { key: KEY });
+            }
+            if interface != Interface::Topic {
+                self.record(&written.origin, Mistake::TopicsOnly { key: KEY, interface: interface.key() });
+            }
+            if let Some(topic) = topic.as_ref().filter(|topic| is_pattern(topic)) {
+                self.record(&written.origin, Mistake::DeadManOfMany { key: KEY, topic: topic.clone() });
+            }
+            self.dead_man(written)
+        });
         Some(UseConfig {
             from: from?,
             interface,
             topic: topic?,
             naming: naming?,
             frame_prefix,
+            dead_man,
             type_name,
             publish,
             priority,
@@ -973,6 +988,23 @@ impl Resolver<'_> {
             qos,
             dedicated,
         })
+    }
+
+    fn dead_man(&mut self, written: &DeadManDraft) -> Option<DeadManConfig> {
+        let after = written.after.as_ref().and_then(|after| self.keep(after, names::dead_man_time));
+        let base_dir = self.base_dir;
+        let stop = written.publish.as_ref().and_then(|publish| {
+            self.keep(publish, |key, value| match value {
+                "zero" => Ok(StopSource::Zero),
+                "last" => Ok(StopSource::Last),
+                file if file.ends_with(".json") => Ok(StopSource::File(base_dir.join(file))),
+                _ => Err(unknown_word(key, value, &["zero", "last", "FILE.json"])),
+            })
+        });
+        let repeat = written.repeat.as_ref().and_then(|repeat| self.keep(repeat, names::dead_man_time));
+        let resume =
+            written.resume.as_ref().and_then(|resume| self.keep(resume, resume_of)).unwrap_or_default();
+        Some(DeadManConfig { after: after?, stop: stop?, repeat, resume })
     }
 
     fn frame_prefix(&mut self, one: &UseDraft) -> Option<String> {
@@ -1176,6 +1208,14 @@ fn reliability(key: &'static str, value: &str) -> Result<Reliability, Mistake> {
         "reliable" => Ok(Reliability::Reliable),
         "best_effort" => Ok(Reliability::BestEffort),
         _ => Err(unknown_word(key, value, &["reliable", "best_effort"])),
+    }
+}
+
+fn resume_of(key: &'static str, value: &str) -> Result<Resume, Mistake> {
+    match value {
+        "auto" => Ok(Resume::Auto),
+        "manual" => Ok(Resume::Manual),
+        _ => Err(unknown_word(key, value, &["auto", "manual"])),
     }
 }
 

@@ -14,6 +14,8 @@ pub enum Table {
     Ros,
     /// `[ros.zenoh]`
     RosZenoh,
+    /// `[use.deadman]`
+    UseDeadMan,
     /// `[[share]]`
     Share,
     /// `[[use]]`
@@ -42,11 +44,12 @@ pub enum Table {
 
 impl Table {
     /// All tables, in the order of the reference.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 17] = [
         Self::Top,
         Self::Node,
         Self::Ros,
         Self::RosZenoh,
+        Self::UseDeadMan,
         Self::Share,
         Self::Use,
         Self::Partner,
@@ -68,6 +71,7 @@ impl Table {
             Self::Node => "[node]",
             Self::Ros => "[ros]",
             Self::RosZenoh => "[ros.zenoh]",
+            Self::UseDeadMan => "[use.deadman]",
             Self::Share => "[[share]]",
             Self::Use => "[[use]]",
             Self::Router => "[router]",
@@ -127,6 +131,7 @@ impl Table {
                 "zenoh",
             ],
             Self::RosZenoh => &["router", "config"],
+            Self::UseDeadMan => &["after", "publish", "repeat", "resume"],
             Self::Share => &[
                 "topic",
                 "service",
@@ -184,6 +189,7 @@ impl Table {
                 "deadline",
                 "lifespan",
                 "token",
+                "deadman",
                 "link",
             ],
             Self::Router => &[
@@ -231,6 +237,7 @@ impl Table {
             Self::Top => &["profile"],
             Self::Ros
             | Self::RosZenoh
+            | Self::UseDeadMan
             | Self::Node
             | Self::Router
             | Self::Transport
@@ -247,12 +254,12 @@ impl Table {
     }
 
     /// Returns the tables that have `key`, with the key. Tables within tables do not count: a `router` in `[node]` is
-    /// no misplaced `[router]`. Nor do the keys of `[ros.zenoh]`, whose words are too common.
+    /// no misplaced `[router]`. Nor do the keys of `[ros.zenoh]` and `[use.deadman]`, whose words are too common.
     pub(crate) fn homes(key: &str) -> Option<(&'static str, Vec<&'static str>)> {
         let has = |table: &&Self| {
             let counts = match table {
                 Self::Top => key == "identity",
-                Self::RosZenoh => false,
+                Self::RosZenoh | Self::UseDeadMan => false,
                 _ => true,
             };
             counts && table.keys().contains(&key)

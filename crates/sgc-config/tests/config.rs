@@ -10,9 +10,9 @@ use std::time::Duration;
 #[cfg(feature = "otlp")]
 use sgc_config::OtlpConfig;
 use sgc_config::{
-    ArgsConfig, AuditConfig, AuditRoom, Config, ConfigErrors, DiscoveryRange, GATEWAY_NAMES_MAX,
-    GatewayConfig, Naming, Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, SecurityConfig, Shaping,
-    Table, TokenConfig, TokenSource, TransportConfig, parse,
+    ArgsConfig, AuditConfig, AuditRoom, Config, ConfigErrors, DeadManConfig, DiscoveryRange,
+    GATEWAY_NAMES_MAX, GatewayConfig, Naming, Recipient, Rename, Resume, RotationConfig, SHARES_MAX, SUITES,
+    SecurityConfig, Shaping, StopSource, Table, TokenConfig, TokenSource, TransportConfig, parse,
 };
 use sgc_gateway::{Anonymous, Right};
 use sgc_transport::Congestion;
@@ -211,7 +211,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
             &[
-                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `encoding`, `reliability`, `durability`, `history`, `depth`, `deadline`, `lifespan`, `token`, `link`",
+                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `encoding`, `reliability`, `durability`, `history`, `depth`, `deadline`, `lifespan`, `token`, `deadman`, `link`",
             ],
         ),
         ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
@@ -321,6 +321,26 @@ fn a_topic_has_the_type_of_a_message() {
             "node.toml:6: `type` is \"std_srvs/srv/Empty\"; the type of `topic` is spelt like \"std_msgs/msg/String\"",
         ],
     )]);
+}
+
+#[test]
+fn a_use_may_have_a_dead_man_switch() {
+    let uses = good(&format!(
+        "{NODE}[[use]]\nfrom = 'b'\ntopic = '/a'\ndeadman = {{ after = '300ms', publish = 'zero' }}\n\
+         [[use]]\nfrom = 'b'\ntopic = '/b'\n[use.deadman]\nafter = '1s'\npublish = 'stop.json'\nrepeat = '100ms'\n\
+         resume = 'manual'\n[[use]]\nfrom = 'b'\ntopic = '/c'"
+    ))
+    .uses;
+    let ms = Duration::from_millis;
+    let first = DeadManConfig { after: ms(300), stop: StopSource::Zero, repeat: None, resume: Resume::Auto };
+    let second = DeadManConfig {
+        after: ms(1000),
+        stop: StopSource::File("/etc/sgc/stop.json".into()),
+        repeat: Some(ms(100)),
+        resume: Resume::Manual,
+    };
+    let switches: Vec<_> = uses.into_iter().map(|one| one.dead_man).collect();
+    assert_eq!(switches, [Some(first), Some(second), None]);
 }
 
 #[test]
@@ -464,6 +484,25 @@ fn names_that_do_not_fit_together_are_told() {
         (
             "[[use]]\nfrom = 'b'\ntopic = '/tf'\nframe_prefix = 'b/'\npublish = true",
             &["node.toml:6: `frame_prefix` is for what comes here: take it out, or `publish`"],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\ntopic = '/**'\ndeadman = { after = '5ms', publish = 'halt', repeat = 'x', resume = 'car', of = 1 }",
+            &[
+                "node.toml:6: [use.deadman] has no key `of`; it has `after`, `publish`, `repeat`, `resume`",
+                "node.toml:6: `deadman` is for one topic, and \"/**\" may match several: name the topic of commands",
+                "node.toml:6: `after` is \"5ms\"; it takes a length of time, \"20ms\" to \"60s\": \"300ms\", \"1s\"",
+                "node.toml:6: `publish` is \"halt\"; it takes \"zero\", \"last\", \"FILE.json\"",
+                "node.toml:6: `repeat` is \"x\"; it takes a length of time, \"20ms\" to \"60s\": \"300ms\", \"1s\"",
+                "node.toml:6: `resume` is \"car\"; it takes \"auto\", \"manual\"",
+            ],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\nservice = '/a'\ndeadman = {}",
+            &[
+                "node.toml:6: [use.deadman] has no `after`; add one, such as after = \"300ms\"",
+                "node.toml:6: [use.deadman] has no `publish`; add one, such as publish = \"zero\"",
+                "node.toml:6: `deadman` is for topics, and this is about `service`: take it out",
+            ],
         ),
         (
             "[[use]]\nfrom = 'b'\ntopic = '/**'\n[[use]]\nfrom = 'b'\ntopic = '/**'",
@@ -1099,6 +1138,7 @@ fn a_token_says_owner_and_topic_itself() {
             source,
             naming: Default::default(),
             frame_prefix: None,
+            dead_man: None,
             qos: Default::default(),
             dedicated: false
         }]

@@ -8,10 +8,11 @@ use std::path::Path;
 use sgc_gateway::Anonymous;
 use sgc_node::alerts::{Alert, clock_alert};
 use sgc_node::config::{
-    Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig, TokenSource,
-    ZenohConfig,
+    Config, DeadManConfig, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, Resume, RouterUrl,
+    ShareConfig, StopSource, TokenSource, ZenohConfig,
 };
 use sgc_node::discovery_server;
+use sgc_node::read_stop;
 use sgc_process::files;
 use sgc_process::unix_now;
 use sgc_trust::{Fleet, Identity};
@@ -120,6 +121,14 @@ pub fn summary(
         if one.shaping.form == PayloadForm::Json {
             row("", json(config, one.type_name.as_deref()));
         }
+        if let Some(switch) = &one.dead_man {
+            row("", dead_man(switch));
+            if let StopSource::File(file) = &switch.stop
+                && let Err(error) = read_stop(file)
+            {
+                row(WARNING, format!("the node will not start: {error}"));
+            }
+        }
     }
     for token in &config.tokens {
         match &token.source {
@@ -193,6 +202,21 @@ pub fn summary(
         rows.push(vec![WARNING.to_owned(), format!("{alert}: {}", alert.fix())]);
     }
     Ok(rows)
+}
+
+/// Describes a dead-man switch.
+fn dead_man(switch: &DeadManConfig) -> String {
+    let stop = match &switch.stop {
+        StopSource::Zero => "a message of zeros".to_owned(),
+        StopSource::Last => "the last command again".to_owned(),
+        StopSource::File(file) => format!("the message in {}", file.display()),
+    };
+    let every = switch.repeat.map_or(String::new(), |repeat| format!(", every {repeat:?}"));
+    let end = match switch.resume {
+        Resume::Auto => "until somebody lets go and begins again",
+        Resume::Manual => "until `sgc topic resume`",
+    };
+    format!("{:?} without a command: {stop}{every}, {end}", switch.after)
 }
 
 /// Reads the fleet file that a user named.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use sgc_node::admin::not_direct::NotDirectReason;
 use sgc_node::alerts::Alert;
-use sgc_node::graph::{Graph, Interface};
+use sgc_node::graph::{DeadMan, Graph, Interface};
 
 use crate::refusals::Refusal;
 
@@ -315,6 +315,15 @@ pub(crate) enum UseFinding {
         messages: u64,
         /// Time since the last one, seconds.
         last_s: Option<u64>,
+    },
+    /// The dead-man switch has stopped the robot.
+    Stopped {
+        dead_man: DeadMan,
+        topic: String,
+    },
+    /// Commands pass the dead-man switch.
+    CommandsPass {
+        stops: u64,
     },
     /// The local publishers have other types than the owner takes.
     TakesOther {

@@ -520,6 +520,21 @@ const PACKETS: &[Refusal] = &[
         "older than max_age",
         "raise max_age, or compare the clocks of the hosts",
     ),
+    counted(
+        DataDrop::LateCommand.key(),
+        "a command of a topic with `deadman` came late",
+        "a queue on the way, or the publisher's clock was set back: `sgc topic resume` measures anew",
+    ),
+    counted(
+        DataDrop::UnjudgedCommand.key(),
+        "a command of a topic with `deadman` whose lateness is not known: it has no time stamp, or its publisher is new",
+        "",
+    ),
+    counted(
+        DataDrop::NotResumed.key(),
+        "`deadman` stopped the robot, and the publisher of the commands has not let go since",
+        "let go for the time of `after`, and begin again; with resume = \"manual\": `sgc topic resume`",
+    ),
     counted(DataDrop::Repeated.key(), "a publisher's history came once more after its node started anew", ""),
     counted(
         DataDrop::Overrun.key(),

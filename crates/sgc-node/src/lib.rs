@@ -35,7 +35,7 @@ pub use control::fleet::members::{UnknownMember, unknown_members};
 pub use control::fleet::operations::OperationError;
 pub use control::fleet::operators::{roster_head, roster_row};
 pub use control::settings::reload::{ConfigSource, ReloadReport};
-pub use control::settings::rules::{RulesError, read_token};
+pub use control::settings::rules::{RulesError, read_stop, read_token};
 pub use data::stats::DataDrop;
 pub use discovery::RouterStatus;
 pub use drops::NodeDrop;

@@ -429,6 +429,7 @@ fn spy_gets_nothing(ops: &Lab, a: &Lab, b: &Lab, is_refused: impl Fn(&Node, &Nod
             source: TokenSource::Text(Box::new(token)),
             naming: Default::default(),
             frame_prefix: None,
+            dead_man: None,
             qos: Default::default(),
             dedicated: false,
         }];

@@ -162,6 +162,7 @@ impl Way {
             topic: TOPIC.into(),
             naming: Default::default(),
             frame_prefix: None,
+            dead_man: None,
             type_name: None,
             priority: None,
             shaping: Shaping::default(),

@@ -191,6 +191,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
         source: TokenSource::Text(Box::new(token.clone())),
         naming: Default::default(),
         frame_prefix: None,
+        dead_man: None,
         qos: Default::default(),
         dedicated: false,
     }];

@@ -1008,6 +1008,7 @@ fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
                 source,
                 naming: Default::default(),
                 frame_prefix: None,
+                dead_man: None,
                 qos: Default::default(),
                 dedicated: false,
             }
@@ -1095,6 +1096,7 @@ fn the_audit_log_tells_what_happened_and_no_secret() {
             source: TokenSource::Text(Box::new(token.clone())),
             naming: Default::default(),
             frame_prefix: None,
+            dead_man: None,
             qos: Default::default(),
             dedicated: false,
         }]

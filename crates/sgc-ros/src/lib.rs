@@ -30,9 +30,9 @@ pub use qos::{
     SERVICE_DEPTH, UNACKNOWLEDGED_MIN, for_all_instances, mismatches, reader_for, service_qos, weakest,
 };
 pub use routes::{
-    ANNOUNCED_EVERY, AnnouncedPublishers, Command, Consumers, Direction, GLOBAL_TOPICS, HEARD_MIN,
-    LITERAL_TOPICS, LocalEnd, Naming, OfferView, Offerer, OwnerState, Problem, REDISCOVERY_HOLD,
-    ROUTES_PER_WILDCARD_MAX, Rename, RouteKind, RouteState, RouteStatus, Routes, SINKLESS_HOLD, Shaping,
-    ShareRouteView, ShareRule, ShareRuleId, ShareView, UNREACHABLE_HOLD, UseRouteView, UseRule, UseRuleId,
-    UseView, WRITERLESS_HOLD, Way, is_for_wildcards, is_pattern, matches,
+    ANNOUNCED_EVERY, AnnouncedPublishers, Command, Consumers, DeadManRule, Direction, GLOBAL_TOPICS,
+    HEARD_MIN, LITERAL_TOPICS, LocalEnd, Naming, OfferView, Offerer, OwnerState, Problem, REDISCOVERY_HOLD,
+    ROUTES_PER_WILDCARD_MAX, Rename, Resume, RouteKind, RouteState, RouteStatus, Routes, SINKLESS_HOLD,
+    Shaping, ShareRouteView, ShareRule, ShareRuleId, ShareView, StopMessage, UNREACHABLE_HOLD, UseRouteView,
+    UseRule, UseRuleId, UseView, WRITERLESS_HOLD, Way, is_for_wildcards, is_pattern, matches,
 };

@@ -37,6 +37,9 @@ pub use naming::{GLOBAL_TOPICS, LITERAL_TOPICS, Naming, Rename, is_for_wildcards
 pub use own_sources::WRITERLESS_HOLD;
 pub use owners::{OwnerState, REDISCOVERY_HOLD};
 pub use problem::{LocalEnd, Offerer, Problem, Way};
-pub use rules::{Direction, ROUTES_PER_WILDCARD_MAX, Shaping, ShareRule, ShareRuleId, UseRule, UseRuleId};
+pub use rules::{
+    DeadManRule, Direction, ROUTES_PER_WILDCARD_MAX, Resume, Shaping, ShareRule, ShareRuleId, StopMessage,
+    UseRule, UseRuleId,
+};
 pub use share_route::{ANNOUNCED_EVERY, AnnouncedPublishers, HEARD_MIN, SINKLESS_HOLD};
 pub use use_route::UNREACHABLE_HOLD;

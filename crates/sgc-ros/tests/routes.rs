@@ -72,6 +72,7 @@ fn use_of(owner: NodeId, topic: &str, type_name: Option<&str>) -> UseRule {
         topic: topic.into(),
         naming: Naming::default(),
         frame_prefix: None,
+        dead_man: None,
         type_name: type_name.map(Into::into),
         dedicated: false,
         token: None,

@@ -148,6 +148,7 @@ fn a_remote_service_is_here_while_it_is_granted_and_a_topic_of_its_name_is_not()
         topic: "/add".into(),
         naming: Naming::default(),
         frame_prefix: None,
+        dead_man: None,
         type_name: None,
         dedicated: false,
         token: None,

@@ -1,5 +1,5 @@
 //! Decisions about the links of a node, and about the traffic that it starts by itself: keep-alive, back-off, bulk lanes,
-//! claims, candidates, port mappings, questions for types, shaping. [`LinkSupervisor`] decides when a link is replaced.
+//! claims, candidates, port mappings, questions for types, shaping, dead-man switches. [`LinkSupervisor`] decides when a link is replaced.
 //!
 //! Pure machines: time and randomness are arguments, and nothing here opens a socket, spawns a task or waits.
 //! `sgc-node` observes, passes events in, and carries the results out.
@@ -9,6 +9,7 @@ mod backoff;
 mod bulk;
 mod candidates;
 mod claims;
+mod dead_man;
 mod direct;
 mod failback;
 mod keep_alive;
@@ -25,6 +26,7 @@ pub use bulk::{
 };
 pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates, is_of_host};
 pub use claims::ClaimTable;
+pub use dead_man::{Command, CommandRefusal, DeadMan, StopCause};
 pub use direct::{
     DIRECT_ATTEMPT_MAX, DIRECT_ATTEMPTS_MAX, DIRECT_PEERS_MAX, DirectLinkTable, DirectOutput, DirectPaths,
     LocalAddress, NoDirectPath, REFLEXIVE_MAX, is_checkable, local_addresses,

@@ -971,12 +971,13 @@ fn leaves(command: &clap::Command, name: &str) -> Vec<(String, clap::Command)> {
 }
 
 /// Commands without `--json`, and why.
-const WITHOUT_JSON: [(&str, &str); 5] = [
+const WITHOUT_JSON: [(&str, &str); 6] = [
     ("bench answer", "waits, and tells a person the command for the other machine"),
     ("completions", "prints a program for a shell"),
     ("router", "runs a node; --log-format has the form of its log"),
     ("run", "runs a node; --log-format has the form of its log"),
     ("topic pub", "prints the messages that the caller gave"),
+    ("topic resume", "prints only that it is done"),
 ];
 
 #[test]

@@ -184,6 +184,17 @@ fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
         fine(UseFinding::Received { messages: route.messages, last_s: route.last_s })
     });
     traffic(&line, Direction::In, steps);
+    if let Some(dead_man) = &route.dead_man {
+        let (dead_man, topic) = (dead_man.clone(), topic.to_owned());
+        // Nothing that came was held back, so silence is no fault.
+        let held_back = dead_man.late + dead_man.unjudged + dead_man.not_resumed;
+        let is_idle = held_back == 0 && dead_man.no_stop_message.is_none();
+        steps.push(match &dead_man.stopped {
+            None => fine(UseFinding::CommandsPass { stops: dead_man.stops }),
+            Some(_) if is_idle => fine(UseFinding::Stopped { dead_man, topic }),
+            Some(_) => wrong(UseFinding::Stopped { dead_man, topic }),
+        });
+    }
 }
 
 /// Returns whether the path to an owner over a link is direct, and why not. An earlier version does not tell the reason.

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use sgc_node::graph::{
-    Endpoint, Graph, Interface, JoinState, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, Use,
-    UseRoute,
+    DeadMan, Endpoint, Graph, Interface, JoinState, Link, NameLine, Offer, Qos, Search, Share, ShareRoute,
+    Use, UseRoute,
 };
 use sgc_wire::{RefuseReason, RejectReason};
 
@@ -265,6 +265,16 @@ pub(super) fn user_faults() -> Vec<Case> {
         }),
         ("travel as JSON, and no definition of std_msgs/msg/String is known here", |g| {
             g.uses[0].routes[0].lacks_definition = true;
+        }),
+        ("because commands came late; 2 commands were late; 7 commands were of a publisher", |g| {
+            let stopped = Some("late".to_owned());
+            let dead_man = DeadMan { stopped, stopped_s: 4, late: 2, not_resumed: 7, ..DeadMan::default() };
+            g.uses[0].routes[0].dead_man = Some(dead_man);
+        }),
+        ("no command passes, because it has no stop message: the type is unknown", |g| {
+            let (stopped, no_stop_message) =
+                (Some("start".to_owned()), Some("the type is unknown".to_owned()));
+            g.uses[0].routes[0].dead_man = Some(DeadMan { stopped, no_stop_message, ..DeadMan::default() });
         }),
         ("no way leads to it now", |g| {
             g.uses[0].routes[0].is_granted = false;

@@ -470,8 +470,32 @@ pub struct UseRoute {
     pub messages: u64,
     /// Time in seconds since the last message was written to the local network.
     pub last_s: Option<u64>,
+    /// Dead-man switch, if it has one.
+    pub dead_man: Option<DeadMan>,
     /// Whether messages travel as JSON although their type is unknown here.
     pub lacks_definition: bool,
+}
+
+/// The dead-man switch of a topic that comes here.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct DeadMan {
+    /// Why the robot is stopped: `start`, `silence`, `late` or `closed`; null while commands pass.
+    pub stopped: Option<String>,
+    /// Time in seconds since it was stopped.
+    pub stopped_s: u64,
+    /// Why the stop message cannot be published; no command passes until it can.
+    pub no_stop_message: Option<String>,
+    /// Whether only `sgc topic resume` lets commands pass again.
+    pub is_manual: bool,
+    /// Number of stop messages that were published.
+    pub stops: u64,
+    /// Number of commands that came late.
+    pub late: u64,
+    /// Number of commands whose lateness could not be known.
+    pub unjudged: u64,
+    /// Number of commands that came in time, after a stop and before somebody let go and began again.
+    pub not_resumed: u64,
 }
 
 /// An entry of an owner's catalogue for this node.

@@ -116,6 +116,8 @@ pub enum AdminRequest {
     Report(ReportRequest),
     /// Return the [`AuditAnswer`].
     Audit,
+    /// Let commands pass the dead-man switches of this topic, by its name on the local network.
+    Resume(String),
 }
 
 /// The last records of a node's audit log.
@@ -272,6 +274,10 @@ impl AdminRequest {
             ("status", "") => Ok(Self::Status),
             ("reload", "") => Ok(Self::Reload),
             ("audit", "") => Ok(Self::Audit),
+            ("resume", topic) if topic.starts_with('/') && topic.len() <= TOPIC_BYTES_MAX => {
+                Ok(Self::Resume(topic.to_owned()))
+            }
+            ("resume", _) => Err(AdminError::Argument { word: "resume" }),
             ("crl", list) => match STANDARD.decode(list) {
                 Ok(list) if !list.is_empty() && list.len() <= CRL_BYTES_MAX => Ok(Self::Crl(list)),
                 _ => Err(AdminError::Argument { word: "crl" }),
@@ -323,6 +329,7 @@ impl AdminRequest {
             Self::Status => format!("{ADMIN_PREFIX}status\n"),
             Self::Reload => format!("{ADMIN_PREFIX}reload\n"),
             Self::Audit => format!("{ADMIN_PREFIX}audit\n"),
+            Self::Resume(topic) => format!("{ADMIN_PREFIX}resume {topic}\n"),
             Self::Crl(list) => format!("{ADMIN_PREFIX}crl {}\n", STANDARD.encode(list)),
             Self::Graph(None) => format!("{ADMIN_PREFIX}graph\n"),
             Self::Graph(Some(name)) => format!("{ADMIN_PREFIX}graph {name}\n"),
@@ -509,6 +516,9 @@ async fn answer(mut stream: UnixStream, is_own: bool, desk: &Desk, taps: &Semaph
         Ok(AdminRequest::Operate { .. }) if !is_own => {
             envelope(Err("only the user of this node and root may change the fleet through it".to_owned()))
         }
+        Ok(AdminRequest::Resume(_)) if !is_own => {
+            envelope(Err("only the user of this node and root may let commands pass".to_owned()))
+        }
         Ok(request) => envelope(carry_out(request, desk).await),
         Err(error) => envelope(Err(error.to_string())),
     };
@@ -640,6 +650,12 @@ async fn carry_out(request: AdminRequest, desk: &Desk) -> Result<String, String>
             let answer = done.await.map_err(|_| stopping())?.map_err(|error| error.to_string())?;
             let answer = Zeroizing::new(STANDARD.encode(Zeroizing::new(answer.to_vec())));
             Ok(serde_json::json!({ "answer": *answer }).to_string())
+        }
+        AdminRequest::Resume(topic) => {
+            let (reply, done) = oneshot::channel();
+            events.send(CoreEvent::Resume(topic, reply)).await.map_err(|_| stopping())?;
+            done.await.map_err(|_| stopping())?.map_err(|error| error.to_string())?;
+            Ok("null".to_owned())
         }
         AdminRequest::Audit => {
             let answer = AuditAnswer { node: desk.node.clone(), records: desk.audit.recent() };
@@ -783,6 +799,7 @@ mod tests {
             AdminRequest::Status,
             AdminRequest::Reload,
             AdminRequest::Audit,
+            AdminRequest::Resume("/cmd_vel".into()),
             AdminRequest::Crl(vec![0x30, 0, 255]),
             AdminRequest::Graph(None),
             AdminRequest::Graph(Some(Name([0xab; 32]))),
@@ -852,6 +869,8 @@ mod tests {
             (b"sgc/1 operate keeper AA", AdminError::Argument { word: "operate" }),
             (b"sgc/1 publish /a", AdminError::Argument { word: "publish" }),
             (b"sgc/1 report arm-1", AdminError::Argument { word: "report" }),
+            (b"sgc/1 resume", AdminError::Argument { word: "resume" }),
+            (b"sgc/1 resume cmd_vel", AdminError::Argument { word: "resume" }),
             (b"sgc/1 audit now", AdminError::Unknown { word: "audit".into() }),
             (b"sgc/1 reload now", AdminError::Unknown { word: "reload".into() }),
         ] {

@@ -434,6 +434,7 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Graph(name, reply) => {
                 let _ = reply.send(self.graph(name));
             }
+            CoreEvent::Resume(topic, reply) => drop(reply.send(self.resume(&topic))),
             CoreEvent::Tap(wish, reply) => self.tap(wish, reply),
             CoreEvent::Quiesce(reply) => {
                 let _ = reply.send(self.quiesce());

@@ -24,6 +24,7 @@ use crate::control::fleet::operations::OperationError;
 use crate::control::peers::control_queue::{FrameRoom, InboxShare};
 use crate::control::types::type_jobs::TypeOutcome;
 use crate::data::dataplane::DataPlane;
+use crate::data::dead_man::ResumeError;
 use crate::data::outflow::OutFlow;
 use crate::data::sending::message_keys::MessageKeys;
 use crate::data::tap::{Tap, TapError, TapRequest};
@@ -214,6 +215,8 @@ pub(crate) enum CoreEvent {
     Status(oneshot::Sender<Status>),
     /// Asks for the graph, also of a name that is not in use here.
     Graph(Option<Name>, oneshot::Sender<Graph>),
+    /// Lets commands pass the dead-man switches of this topic.
+    Resume(String, oneshot::Sender<Result<(), ResumeError>>),
     /// Asks for a tap.
     Tap(TapRequest, oneshot::Sender<Result<Tap, TapError>>),
     /// Stop receiving. Answered with the queues that still have to drain.

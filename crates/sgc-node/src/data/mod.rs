@@ -10,6 +10,7 @@ pub(crate) mod call_ledger;
 pub(crate) mod calls;
 pub(crate) mod conversion;
 pub(crate) mod dataplane;
+pub(crate) mod dead_man;
 pub(crate) mod labels;
 pub(crate) mod outflow;
 pub(crate) mod pending;

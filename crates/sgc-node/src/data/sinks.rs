@@ -8,9 +8,9 @@ use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use arc_swap::ArcSwap;
+use arc_swap::{ArcSwap, ArcSwapOption};
 use sgc_endpoint::{AskAgain, Delivery, Message, Receivers, Sink, SinkDrop, SinkLimits, SinkProgress};
-use sgc_ros::Shaping;
+use sgc_ros::{DeadManRule, Shaping};
 use sgc_router::LinkId;
 use sgc_sync::lock;
 use sgc_wire::{MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId, SourceId, TopicGrant};
@@ -20,6 +20,7 @@ use tracing::{debug, warn};
 
 use crate::clock::unix_ns;
 use crate::data::conversion::{KnownType, TypeSlot};
+use crate::data::dead_man::{DeadManSwitch, DeadManView};
 use crate::data::pending::{PendingBytes, PendingQueue};
 use crate::data::stats::{CountDrops, DataDrop, Dropped, Drops};
 use crate::data::tap::{TapMessage, Taps};
@@ -80,6 +81,7 @@ pub(crate) struct LocalSink {
     shaping: Mutex<Shaping>,
     taps: Taps,
     frames: FramePrefix,
+    dead_man: ArcSwapOption<DeadManSwitch>,
     types: Arc<TypeSlot>,
     /// Whether messages arrive as JSON.
     takes_json: AtomicBool,
@@ -111,6 +113,7 @@ impl LocalSink {
             shaping: Mutex::default(),
             taps: Taps::default(),
             frames: FramePrefix::default(),
+            dead_man: ArcSwapOption::empty(),
             types: Arc::default(),
             takes_json: AtomicBool::new(false),
             asks_for_writer: AtomicBool::new(false),
@@ -294,8 +297,16 @@ impl LocalSink {
         let mut state = self.lock();
         state.held.asked = None;
         let mut writers = BTreeMap::clone(&self.writers.load());
+        if writer.is_none() && writers.len() == 1 && writers.contains_key(&source) {
+            self.stop_before_close();
+        }
         let old = match writer {
-            Some(writer) => writers.insert(source, writer),
+            Some(writer) => {
+                if self.dead_man.load().is_some() {
+                    writer.wait_for_no_reader();
+                }
+                writers.insert(source, writer)
+            }
             None => {
                 if let (Some(source), Some(sink)) = (source, &mut state.sink) {
                     sink.forget(&source);
@@ -307,6 +318,9 @@ impl LocalSink {
         self.writers.store(Arc::new(writers));
         if opened {
             self.ask_for_missed(&mut state);
+            if let Some(switch) = &*self.dead_man.load() {
+                switch.try_again();
+            }
         }
         let Some(old) = old else {
             drop(state);
@@ -382,6 +396,9 @@ impl LocalSink {
         if !is_awaited {
             self.release_held(data);
         }
+        if let Some(switch) = &*self.dead_man.load() {
+            switch.try_again();
+        }
     }
 
     /// Writes or drops the messages that waited for their type or a writer, if there is a writer. Those whose type is
@@ -417,6 +434,73 @@ impl LocalSink {
         !self.transient_local && message.head.kind == MessageKind::Write
     }
 
+    /// Sets the dead-man switch, or removes it. A new one stops the robot as soon as there is a writer.
+    pub(crate) fn set_dead_man(self: &Arc<Self>, rule: Option<DeadManRule>) {
+        let Some(rule) = rule else { return self.dead_man.store(None) };
+        if let Some(switch) = &*self.dead_man.load() {
+            return switch.set(rule, &self.types);
+        }
+        self.writers.load().values().for_each(|writer| writer.wait_for_no_reader());
+        let switch = Arc::new(DeadManSwitch::new(rule));
+        self.dead_man.store(Some(switch.clone()));
+        let (changed, switch, sink) = (switch.changed(), Arc::downgrade(&switch), Arc::downgrade(self));
+        tokio::spawn(async move {
+            while let Some(due) = switch.upgrade().map(|switch| switch.due()) {
+                match due {
+                    Some(due) => drop(timeout_at(due.into(), changed.notified()).await),
+                    None => changed.notified().await,
+                }
+                if let Some(sink) = sink.upgrade() {
+                    sink.tick_dead_man();
+                }
+            }
+        });
+    }
+
+    /// Returns the state of the dead-man switch.
+    pub(crate) fn dead_man(&self) -> Option<DeadManView> {
+        self.dead_man.load().as_ref().map(|switch| switch.view())
+    }
+
+    /// Lets the next command in time pass the dead-man switch. Returns `false` if it has not stopped the robot, and
+    /// `None` if there is no switch.
+    pub(crate) fn resume_dead_man(&self) -> Option<bool> {
+        self.dead_man.load().as_ref().map(|switch| switch.resume())
+    }
+
+    /// Publishes the stop message if it is due. The lock keeps commands that are judged now from overtaking it.
+    fn tick_dead_man(&self) {
+        let Some(switch) = self.dead_man.load_full() else { return };
+        let _state = self.lock();
+        if switch.tick(Instant::now()) {
+            self.publish_stop(&switch);
+        }
+    }
+
+    /// Publishes the stop message before the last writer closes, if the robot may be moving.
+    fn stop_before_close(&self) {
+        if let Some(switch) = self.dead_man.load_full()
+            && switch.close(Instant::now())
+        {
+            self.publish_stop(&switch);
+        }
+    }
+
+    /// Gives the stop message to the writer of the last command, or any.
+    fn publish_stop(&self, switch: &DeadManSwitch) {
+        let writers = self.writers.load();
+        let last = switch.last_source().and_then(|source| writers.get(&Some(source)));
+        let Some(writer) = last.or_else(|| writers.values().next()) else {
+            return switch.note_published(false);
+        };
+        let Ok(message) = switch.stop_message(&self.types) else { return switch.note_published(false) };
+        let Some(message) = message else { return };
+        self.taps.offer(|| self.tapped(&message));
+        // It makes room for itself, so that it is never returned.
+        let is_taken = matches!(writer.try_push(message, true), WriteOutcome::Taken { .. });
+        switch.note_published(is_taken);
+    }
+
     /// Returns the state of the type.
     pub(crate) fn types(&self) -> &Arc<TypeSlot> {
         &self.types
@@ -430,7 +514,11 @@ impl LocalSink {
     /// Closes all writers. They end after their queues.
     pub(crate) fn close(&self) {
         // Neither a type nor a writer will come.
-        drop(self.lock().held.queue.take());
+        {
+            let mut state = self.lock();
+            drop(state.held.queue.take());
+            self.stop_before_close();
+        }
         self.writers.load().values().for_each(|w| w.close());
         self.taps.close();
     }
@@ -560,10 +648,18 @@ impl LocalSink {
         if writer.has_written(&head) {
             return Handover::dropped(DataDrop::Repeated);
         }
+        let switch = self.dead_man.load();
+        if let Some(switch) = &*switch
+            && let Err(reason) = switch.judge(Instant::now(), &message, &self.types)
+        {
+            return Handover::dropped(reason);
+        }
         let tapped = self.taps.is_any().then(|| self.tapped(&message));
         // Converting takes time, and may have to wait for the type.
         let evicted = match writer.try_push(message, head.form != PayloadForm::Json) {
             WriteOutcome::Taken { evicted } => evicted,
+            // A command that waited could overtake the stop message.
+            WriteOutcome::Full(_) if switch.is_some() => return Handover::dropped(DataDrop::Stalled),
             WriteOutcome::Full(message) => return Handover::Full(message),
         };
         self.note_delivered(&head);
@@ -644,6 +740,7 @@ impl Drop for Releasing<'_> {
 mod tests {
     use bytes::Bytes;
     use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
+    use sgc_ros::{Resume, StopMessage};
     use sgc_trust::{MessageKey, Suite};
     use sgc_wire::{Class, MessageHead, SecretBytes};
 
@@ -797,6 +894,92 @@ mod tests {
         assert!(taken.iter().map(|(seq, _)| *seq).eq(0..=50), "{taken:?}");
         // The first message may be taken before the queue is closed, and the last one has none behind it.
         assert!(taken[1..49].iter().all(|(_, next)| *next == NextMessage::Last), "{taken:?}");
+        sink.close();
+    }
+
+    fn dead_man(after: Duration, stop: StopMessage) -> Option<DeadManRule> {
+        Some(DeadManRule { after, stop, repeat: None, resume: Resume::Auto })
+    }
+
+    /// Returns a sink whose dead-man switch has stopped the robot, with the payloads that were written.
+    async fn stopped_sink(
+        stop: StopMessage,
+    ) -> (Arc<LocalSink>, Arc<DataPlane>, Arc<Mutex<Vec<bytes::Bytes>>>) {
+        let (requests, _) = mpsc::channel(1);
+        let (sink, data) =
+            (Arc::new(LocalSink::new(Name([1; 32]), false, requests, Arc::default())), Arc::default());
+        sink.set_dead_man(dead_man(Duration::from_millis(200), stop));
+        let payloads = Arc::<Mutex<Vec<_>>>::default();
+        let written = payloads.clone();
+        let queue = taking(move |message, _| written.lock().unwrap().push(message.payload));
+        sink.set_writer(None, Some(queue), &data);
+        (sink, data, payloads)
+    }
+
+    /// Writes a command that is published now.
+    async fn command(sink: &LocalSink, seq: u64, payload: &[u8]) -> Result<(), Dropped> {
+        let head = MessageHead::new(MessageKind::Write, unix_ns());
+        sink.write(Message { head, payload: bytes::Bytes::copy_from_slice(payload), ..message(seq, 0) }).await
+    }
+
+    /// Writes commands until one passes, and returns its number.
+    async fn commands_until_one_passes(sink: &LocalSink) -> u64 {
+        for seq in 1.. {
+            match command(sink, seq, b"go").await {
+                Ok(()) => return seq,
+                Err(dropped) => assert_eq!(dropped.reason, DataDrop::UnjudgedCommand),
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            assert!(seq < 100, "none passes");
+        }
+        unreachable!()
+    }
+
+    #[tokio::test]
+    async fn a_stop_message_waits_for_a_writer_and_the_type() {
+        let stop = StopMessage::Json("{\"a\": \"stop\"}".into());
+        let (sink, data, payloads) = stopped_sink(stop).await;
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        assert!(payloads.lock().unwrap().is_empty(), "its type is unknown");
+        sink.set_type(any_type(), &data);
+        wait_until(|| payloads.lock().unwrap().len() == 1).await;
+        assert_eq!(payloads.lock().unwrap()[0][..], *b"\0\x01\0\0\x05\0\0\0stop\0");
+        let view = sink.dead_man().unwrap().shown();
+        assert_eq!((view.stopped.as_deref(), view.stops), (Some("start"), 1));
+        // A stop message that is none of the type does not replace it.
+        let wrong = StopMessage::Json("{\"c\": 1}".into());
+        sink.set_dead_man(dead_man(Duration::from_millis(200), wrong));
+        commands_until_one_passes(&sink).await;
+        wait_until(|| payloads.lock().unwrap().len() == 3).await;
+        {
+            let payloads = payloads.lock().unwrap();
+            assert_eq!(payloads[2], payloads[0]);
+        }
+        // Without a switch, everything passes.
+        sink.set_dead_man(None);
+        assert_eq!(command(&sink, 1, b"go").await, Ok(()));
+        assert_eq!(sink.resume_dead_man(), None);
+        sink.close();
+    }
+
+    #[tokio::test]
+    async fn the_last_command_is_published_again_when_none_comes_or_the_writer_closes() {
+        let (sink, data, payloads) = stopped_sink(StopMessage::Last).await;
+        let first = commands_until_one_passes(&sink).await;
+        assert_eq!(sink.resume_dead_man(), Some(false));
+        wait_until(|| payloads.lock().unwrap().len() == 2).await;
+        assert_eq!(*payloads.lock().unwrap(), [&b"go"[..]; 2]);
+        assert_eq!(sink.resume_dead_man(), Some(true));
+        for seq in first + 1..first + 100 {
+            if command(&sink, seq, b"on").await.is_ok() {
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        sink.set_writer(None, None, &data);
+        wait_until(|| payloads.lock().unwrap().len() == 4).await;
+        assert_eq!(payloads.lock().unwrap()[2..], [&b"on"[..]; 2]);
+        assert_eq!(sink.dead_man().unwrap().shown().stopped.as_deref(), Some("closed"));
         sink.close();
     }
 

@@ -89,6 +89,12 @@ pub enum DataDrop {
     NoDefinition,
     /// The message does not match its type and was not converted to JSON.
     NotConverted,
+    /// A command of a topic with a dead-man switch came late.
+    LateCommand,
+    /// A command whose lateness cannot be known yet.
+    UnjudgedCommand,
+    /// A command came after the dead-man switch stopped the robot, and before somebody let go and began again.
+    NotResumed,
 }
 
 /// A drop on the data path: the packet or message itself, or older ones that made room for it.
@@ -114,7 +120,7 @@ impl Dropped {
 
 impl DataDrop {
     /// All reasons in the order of their numbers.
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 23] = [
         Self::NoTree,
         Self::WrongWay,
         Self::HopLimit,
@@ -135,6 +141,9 @@ impl DataDrop {
         Self::Overrun,
         Self::NoDefinition,
         Self::NotConverted,
+        Self::LateCommand,
+        Self::UnjudgedCommand,
+        Self::NotResumed,
     ];
 
     /// Returns a short, stable name for counters.
@@ -160,6 +169,9 @@ impl DataDrop {
             Self::Overrun => "overrun",
             Self::NoDefinition => "no_definition",
             Self::NotConverted => "not_converted",
+            Self::LateCommand => "late_command",
+            Self::UnjudgedCommand => "unjudged_command",
+            Self::NotResumed => "not_resumed",
         }
     }
 }
@@ -312,7 +324,7 @@ mod tests {
         }
         let reasons = stats.reasons();
         assert_eq!(reasons.len(), DataDrop::ALL.len());
-        assert_eq!(reasons["not_converted"], DataDrop::ALL.len() as u64);
+        assert_eq!(reasons["not_resumed"], DataDrop::ALL.len() as u64);
     }
 
     #[test]

@@ -108,6 +108,8 @@ pub(crate) struct WriterQueue {
     awaits_since: Mutex<Instant>,
     /// Whether the writer ever had a reader, as far as that was seen.
     had_reader: AtomicBool,
+    /// Whether messages never wait for a reader.
+    is_hurried: AtomicBool,
     /// Whether liveliness was asserted just now, or is being asserted.
     is_asserted: Arc<AtomicBool>,
     /// Closed once everything is consumed.
@@ -438,6 +440,7 @@ impl WriterQueue {
             awaits_reader: AtomicBool::new(info.awaits_reader),
             awaits_since: Mutex::new(Instant::now()),
             had_reader: AtomicBool::new(false),
+            is_hurried: AtomicBool::new(false),
             info,
             is_asserted: Arc::default(),
             ended,
@@ -533,7 +536,7 @@ impl WriterQueue {
 
     /// Lets messages wait for a reader again, if the writer has lost its readers and was silent.
     fn note_silence(&self) {
-        if !self.info.awaits_reader {
+        if !self.info.awaits_reader || self.is_hurried.load(Relaxed) {
             return;
         }
         if self.matched() > 0 {
@@ -594,6 +597,12 @@ impl WriterQueue {
         self.wake();
         self.remember(&head);
         Ok(())
+    }
+
+    /// Has messages never wait for a local reader, because those that waited would be late.
+    pub(crate) fn wait_for_no_reader(&self) {
+        self.is_hurried.store(true, Relaxed);
+        self.awaits_reader.store(false, Relaxed);
     }
 
     /// Returns the number of matched local readers.

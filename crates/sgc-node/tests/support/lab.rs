@@ -219,6 +219,7 @@ pub fn uses(topic: &str) -> UseConfig {
         topic: topic.into(),
         naming: Default::default(),
         frame_prefix: None,
+        dead_man: None,
         type_name: None,
         priority: None,
         shaping: Shaping::default(),

@@ -5,7 +5,7 @@ use sgc_trust::Policy;
 use sgc_wire::{CatalogueSource, Class, Name, NodeId, Qos, RosNode, SourceId};
 
 use super::problem::Problem;
-use super::rules::Shaping;
+use super::rules::{DeadManRule, Shaping};
 use crate::network::{EndpointSpec, Guid, ServiceSpec};
 
 /// A command to the driver.
@@ -42,6 +42,13 @@ pub enum Command {
         name: Name,
         /// The prefix.
         prefix: Option<String>,
+    },
+    /// Set the dead-man switch of this name. Without this command there is none.
+    DeadMan {
+        /// The joined name.
+        name: Name,
+        /// The switch.
+        rule: Option<DeadManRule>,
     },
     /// End the share.
     Unshare {

@@ -2,6 +2,7 @@
 
 use std::marker::PhantomData;
 use std::ops::Index;
+use std::sync::Arc;
 use std::time::Duration;
 
 use sgc_trust::{Policy, Suite};
@@ -51,6 +52,40 @@ pub struct Shaping {
     pub form: PayloadForm,
 }
 
+/// The dead-man switch of a topic of commands.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DeadManRule {
+    /// The longest time without a command in time, and the most by which a command may be late.
+    pub after: Duration,
+    /// The stop message.
+    pub stop: StopMessage,
+    /// The time after which the stop message is published again; `None` for once.
+    pub repeat: Option<Duration>,
+    /// The end of a stop.
+    pub resume: Resume,
+}
+
+/// The stop message of a dead-man switch.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum StopMessage {
+    /// The message with every field zero or empty, except for the time in its `header`, which is the present.
+    Zero,
+    /// The last command that passed, again.
+    Last,
+    /// This message as JSON (docs/spec/json.md).
+    Json(Arc<str>),
+}
+
+/// The end of a stop.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Resume {
+    /// By itself, when the publisher let go and begins again.
+    #[default]
+    Auto,
+    /// When somebody says so.
+    Manual,
+}
+
 /// The direction of messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Direction {
@@ -88,6 +123,8 @@ pub struct UseRule {
     pub shaping: Shaping,
     /// Policies of the writers here that replace those of the far publishers.
     pub qos: QosOverride,
+    /// The dead-man switch, of a topic that comes here.
+    pub dead_man: Option<DeadManRule>,
     /// `true` if the traffic has a lane of its own.
     pub dedicated: bool,
 }

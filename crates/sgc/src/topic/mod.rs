@@ -7,6 +7,7 @@ mod info;
 mod list;
 mod publish;
 mod rates;
+mod resume;
 
 use std::io::{Read as _, Write as _};
 use std::os::unix::net::UnixStream;
@@ -48,6 +49,7 @@ enum TopicCommand {
     Hz(rates::HzArgs),
     Bw(rates::BwArgs),
     Delay(rates::DelayArgs),
+    Resume(resume::ResumeArgs),
 }
 
 /// The side on which messages of a topic are copied.
@@ -93,6 +95,7 @@ pub(crate) fn topic(args: &TopicArgs) -> Result<ExitCode, CliError> {
         TopicCommand::Hz(args) => rates::hz(args),
         TopicCommand::Bw(args) => rates::bw(args),
         TopicCommand::Delay(args) => rates::delay(args),
+        TopicCommand::Resume(args) => resume::resume(args),
     }
 }
 

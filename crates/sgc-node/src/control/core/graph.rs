@@ -19,6 +19,7 @@ use crate::admin::graph::{
 };
 use crate::admin::not_direct::NOT_DIRECT_MAX;
 use crate::admin::route_words::owner_state;
+use crate::data::dead_man::ResumeError;
 use crate::data::tap::{Tap, TapError, TapMessage, TapQueue, TapRequest, Taps};
 
 impl<N: RosNetwork> Core<N> {
@@ -206,6 +207,7 @@ impl<N: RosNetwork> Core<N> {
                 lacks_definition: self.lacks_definition(&route.name, route.form),
                 messages: published.or(sink.map(|sink| sink.delivered())).unwrap_or(0),
                 last_s: sink.and_then(|sink| sink.since_last()).map(|since| since.as_secs()),
+                dead_man: sink.and_then(|sink| sink.dead_man()).map(|view| view.shown()),
             });
         }
         used
@@ -265,6 +267,22 @@ impl<N: RosNetwork> Core<N> {
             line.dropped = stats.reasons();
         }
         line
+    }
+
+    /// Lets commands pass the dead-man switches of a topic by its name here.
+    pub(super) fn resume(&self, topic: &str) -> Result<(), ResumeError> {
+        let views = self.routes.iter().flat_map(|routes| routes.use_views());
+        let brought = views.filter(|view| view.direction == Direction::Bring).flat_map(|view| view.routes);
+        let names = brought.filter(|route| route.local_name == topic).map(|route| route.name);
+        let mut resumed = None;
+        for sink in names.filter_map(|name| self.sinks.get(&name)) {
+            resumed = resumed.max(sink.resume_dead_man());
+        }
+        match resumed {
+            None => Err(ResumeError::NoSwitch { topic: topic.to_owned() }),
+            Some(false) => Err(ResumeError::NotStopped { topic: topic.to_owned() }),
+            Some(true) => Ok(()),
+        }
     }
 
     /// Opens a tap. A topic from the far side is tapped there, since this node's writers are hidden from its own

@@ -41,6 +41,11 @@ impl<N: RosNetwork> Core<N> {
                     sink.set_frames(prefix);
                 }
             }
+            Command::DeadMan { name, rule } => {
+                if let Some(sink) = self.sinks.get(&name) {
+                    sink.set_dead_man(rule);
+                }
+            }
             Command::UpdateShare { name, qos, sources } => {
                 self.endpoint.update_share(now, &name, qos, sources)
             }

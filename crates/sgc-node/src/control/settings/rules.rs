@@ -7,8 +7,12 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use sgc_config::{Config, Recipient, RouterUrl, TokenConfig, TokenSource, UseConfig};
-use sgc_ros::{Direction, Interface, Part, Shaping, ShareRule, UseRule, is_topic_name};
+use sgc_config::{
+    Config, DeadManConfig, Recipient, RouterUrl, StopSource, TokenConfig, TokenSource, UseConfig,
+};
+use sgc_ros::{
+    DeadManRule, Direction, Interface, Part, Shaping, ShareRule, StopMessage, UseRule, is_topic_name,
+};
 use sgc_trust::{Grantees, Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
 use sgc_wire::{Kind, NodeId, UnixMillis};
 
@@ -21,6 +25,8 @@ use crate::state::fleet_file::read_fleet;
 
 /// Most routers that tokens may add.
 const TOKEN_ROUTERS_MAX: usize = 16;
+/// Longest file with a stop message, in bytes.
+const STOP_TEXT_BYTES_MAX: u64 = 64 << 10;
 
 /// Everything that follows from a configuration and may change at run time.
 #[derive(Clone, Debug, Default)]
@@ -69,7 +75,11 @@ impl Rules {
         let partners = &rules.partners;
         rules.shares =
             config.shares.iter().flat_map(|s| policy::share_rules(s, identity, partners)).collect();
-        let of_fleet = config.uses.iter().flat_map(|u| use_rules(u, identity));
+        let mut of_fleet = Vec::new();
+        for one in &config.uses {
+            let dead_man = one.dead_man.as_ref().map(dead_man_rule).transpose()?;
+            of_fleet.extend(use_rules(one, dead_man.as_ref(), identity));
+        }
         rules.uses.splice(0..0, of_fleet);
         rules.names = peer_names(config, identity, &rules);
         rules.members = MemberNames::from_config(config, identity);
@@ -161,6 +171,7 @@ impl Rules {
             topic,
             naming: wanted.naming.clone(),
             frame_prefix: wanted.frame_prefix.clone(),
+            dead_man: wanted.dead_man.as_ref().map(dead_man_rule).transpose()?,
             type_name: Some(token.metadata.type_name.clone()),
             token: Some((token.name(), token.metadata)),
             class: None,
@@ -169,6 +180,36 @@ impl Rules {
             dedicated: wanted.dedicated,
         });
         Ok(())
+    }
+}
+
+/// Reads the stop message of a dead-man switch, if it is in a file.
+fn dead_man_rule(config: &DeadManConfig) -> Result<DeadManRule, RulesError> {
+    let stop = match &config.stop {
+        StopSource::Zero => StopMessage::Zero,
+        StopSource::Last => StopMessage::Last,
+        StopSource::File(path) => StopMessage::Json(read_stop(path)?),
+    };
+    Ok(DeadManRule { after: config.after, stop, repeat: config.repeat, resume: config.resume })
+}
+
+/// Reads a file with a stop message as JSON, at most 64 KiB.
+///
+/// # Errors
+/// It cannot be read, is too long, or holds no JSON object.
+pub fn read_stop(path: &Path) -> Result<Arc<str>, RulesError> {
+    let failed = |source| RulesError::StopFile { path: path.to_owned(), source };
+    let mut text = String::new();
+    let file = fs::File::open(path).map_err(failed)?;
+    file.take(STOP_TEXT_BYTES_MAX + 1).read_to_string(&mut text).map_err(failed)?;
+    if text.len() as u64 > STOP_TEXT_BYTES_MAX {
+        return Err(failed(io::Error::other(format!("it has more than {STOP_TEXT_BYTES_MAX} bytes"))));
+    }
+    let is_object = serde_json::from_str(&text).map(|json: serde_json::Value| json.is_object());
+    match is_object {
+        Ok(true) => Ok(text.into()),
+        Ok(false) => Err(failed(io::Error::other("it is no JSON object"))),
+        Err(error) => Err(failed(io::Error::other(error))),
     }
 }
 
@@ -185,7 +226,7 @@ pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
 }
 
 /// Returns the rules for the topics and services of a use.
-fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
+fn use_rules(rule: &UseConfig, dead_man: Option<&DeadManRule>, identity: &Identity) -> Vec<UseRule> {
     let Some(owner) = identity.node_id_of(rule.from.as_str()) else { return Vec::new() };
     let part = |part: &Part| UseRule {
         direction: match part.kind {
@@ -200,6 +241,7 @@ fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
         topic: part.name(&rule.topic),
         naming: rule.naming.for_part(part),
         frame_prefix: rule.frame_prefix.clone(),
+        dead_man: dead_man.cloned(),
         type_name: part.type_name(rule.type_name.as_deref()),
         token: None,
         class: rule.priority,
@@ -250,6 +292,14 @@ pub enum RulesError {
         path: PathBuf,
         /// The fault.
         source: TokenError,
+    },
+    /// The stop message of a dead-man switch cannot be read.
+    #[error("stop message {}: {source}", path.display())]
+    StopFile {
+        /// The file.
+        path: PathBuf,
+        /// The fault.
+        source: io::Error,
     },
     /// Two tokens for the same topic.
     #[error("two tokens for {topic} of the same owner: take one [[use]] out")]

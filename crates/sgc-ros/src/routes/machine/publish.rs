@@ -15,7 +15,7 @@ use crate::names::dds_type;
 use crate::network::{DiscoveredEndpoint, EndpointKind};
 use crate::routes::command::Command;
 use crate::routes::problem::Cause;
-use crate::routes::rules::{Direction, Shaping, ShareRule, ShareRuleId, UseRule, UseRuleId};
+use crate::routes::rules::{DeadManRule, Direction, Shaping, ShareRule, ShareRuleId, UseRule, UseRuleId};
 use crate::routes::share_route::{AnnouncedPublishers, ShareRoute};
 use crate::routes::use_route::UseRoute;
 
@@ -86,6 +86,13 @@ impl<R: RngCore> Routes<R> {
     pub(super) fn frames(&mut self, name: Name, prefix: Option<String>) {
         if prefix.is_some() {
             self.commands.push_back(Command::Frames { name, prefix });
+        }
+    }
+
+    /// Sets the dead-man switch. A new name has none, so `None` needs no command.
+    pub(super) fn dead_man(&mut self, name: Name, rule: Option<DeadManRule>) {
+        if rule.is_some() {
+            self.commands.push_back(Command::DeadMan { name, rule });
         }
     }
 

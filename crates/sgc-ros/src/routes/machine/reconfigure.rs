@@ -115,13 +115,16 @@ impl<R: RngCore> Routes<R> {
 
     /// Continues a joined name under another rule.
     fn move_use(&mut self, name: Name, before: &UseRule, place: UseRuleId) {
-        let UseRule { shaping, frame_prefix, qos, .. } = &self.use_rules[place];
+        let UseRule { shaping, frame_prefix, dead_man, qos, .. } = &self.use_rules[place];
         let has_other_qos = *qos != before.qos;
         if *shaping != before.shaping {
             self.commands.push_back(Command::Shape { name, shaping: *shaping });
         }
         if *frame_prefix != before.frame_prefix {
             self.commands.push_back(Command::Frames { name, prefix: frame_prefix.clone() });
+        }
+        if *dead_man != before.dead_man {
+            self.commands.push_back(Command::DeadMan { name, rule: dead_man.clone() });
         }
         if let Some(route) = self.uses.get_mut(&name) {
             route.move_to(place);

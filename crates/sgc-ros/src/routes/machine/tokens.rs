@@ -28,7 +28,8 @@ impl<R: RngCore> Routes<R> {
             self.report(Cause::Token(name), problem);
             return self.close_use(name);
         }
-        let (owner, shaping, prefix) = (rule.owner, rule.shaping, rule.frame_prefix.clone());
+        let (owner, shaping) = (rule.owner, rule.shaping);
+        let (prefix, dead_man) = (rule.frame_prefix.clone(), rule.dead_man.clone());
         self.settle(Cause::Token(name), BTreeSet::new());
         let Some(token) = self.tokens.get_mut(&name) else { return };
         let transient_local = entry.qos.is_transient_local();
@@ -39,6 +40,7 @@ impl<R: RngCore> Routes<R> {
             self.commands.push_back(Command::Join { name, owner, transient_local, describe: true });
             self.shape(name, shaping);
             self.frames(name, prefix);
+            self.dead_man(name, dead_man);
             return;
         }
         if let Some(route) = self.uses.get_mut(&name) {
@@ -65,6 +67,9 @@ impl<R: RngCore> Routes<R> {
             }
             if let Some(prefix) = &rule.frame_prefix {
                 self.commands.push_back(Command::Frames { name, prefix: Some(prefix.clone()) });
+            }
+            if rule.dead_man.is_some() {
+                self.commands.push_back(Command::DeadMan { name, rule: rule.dead_man.clone() });
             }
         }
     }

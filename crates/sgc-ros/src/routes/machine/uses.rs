@@ -199,7 +199,7 @@ impl<R: RngCore> Routes<R> {
 
     fn begin_use(&mut self, name: Name, rule_id: UseRuleId, entry: CatalogueEntry) {
         let rule = &self.use_rules[rule_id];
-        let UseRule { owner, class, shaping, frame_prefix, .. } = rule.clone();
+        let UseRule { owner, class, shaping, frame_prefix, dead_man, .. } = rule.clone();
         let (suite, class) = (entry.suite, class.unwrap_or(entry.class));
         let (reliable, transient_local) = (entry.qos.is_reliable(), entry.qos.is_transient_local());
         let (is_service, direction) = (rule.is_service(), rule.direction);
@@ -215,7 +215,10 @@ impl<R: RngCore> Routes<R> {
         self.shape(name, shaping);
         match direction {
             Direction::Publish => self.find_publishers(),
-            Direction::Bring => self.frames(name, frame_prefix),
+            Direction::Bring => {
+                self.frames(name, frame_prefix);
+                self.dead_man(name, dead_man);
+            }
         }
         self.check_later();
     }
