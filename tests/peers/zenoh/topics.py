@@ -36,6 +36,7 @@ def pub_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--wait-matched", type=int, default=1, help="subscriptions to wait for before sending")
     parser.add_argument("--wait-go", action="store_true", help="once matched, wait for a line on standard input")
     parser.add_argument("--wait-stop", action="store_true", help="a further line there, or its end, ends the sending")
+    parser.add_argument("--begin", type=float, default=0.0, help="seconds between the first message and the second")
     parser.add_argument("--hold", type=float, default=0.0, help="seconds to stay after the last message")
 
 
@@ -103,6 +104,9 @@ def publish(args: argparse.Namespace, run: Run) -> int:
             if args.verbose:
                 emit("sent", seq=args.start + sent)
             sent += 1
+            if sent == 1 and args.begin:
+                run.wait(until=time.monotonic() + args.begin)
+                begun += args.begin
         seconds = time.monotonic() - begun
         emit("all_sent", sent=sent, acknowledged=None)
         # A signal ends only a stay that was asked for.

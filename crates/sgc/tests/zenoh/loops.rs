@@ -46,16 +46,24 @@ fn two_nodes_on_one_network_make_no_loop() {
     }
 }
 
-/// Reads reports until all these numbers have come. Returns how many messages came.
-fn heard_all(listener: &mut Peer, mut expected: BTreeSet<u64>, what: &str) -> u64 {
-    let mut heard = 0;
-    while !expected.is_empty() {
+/// Reads reports until the last message of each publisher has come, which begin with these numbers. Asserts that each came
+/// once, from the first one on. A reader of DDS may be matched too late for the first message, and on a busy machine also
+/// for some of those that follow a second later.
+fn assert_heard(listener: &mut Peer, firsts: &[u64], what: &str) {
+    let ranges: Vec<_> = firsts.iter().map(|first| *first..first + MESSAGES).collect();
+    let mut heard = BTreeSet::new();
+    while !ranges.iter().all(|range| heard.contains(&(range.end - 1))) {
         let event =
-            listener.wait(&format!("{} more of {what}", expected.len()), |e| e["event"] == "received");
-        heard += 1;
-        expected.remove(&event["seq"].as_u64().unwrap());
+            listener.wait(&format!("the last of {what}, after {heard:?}"), |e| e["event"] == "received");
+        let seq = event["seq"].as_u64().unwrap();
+        assert!(heard.insert(seq), "{what}: {seq} came twice");
     }
-    heard
+    for range in ranges {
+        let of: Vec<_> = heard.range(range.clone()).copied().collect();
+        let whole = of[0]..range.end;
+        assert!(of.iter().copied().eq(whole.clone()), "{what}: {of:?}");
+        assert!(whole.start < range.start + MESSAGES / 2, "{what}: {of:?}");
+    }
 }
 
 /// Starts a publisher or a subscriber of one network of the robot.
@@ -87,7 +95,7 @@ fn far_programs_hear_both_networks_of_a_robot_and_are_heard_on_both() {
         let up = ["--topic", "/up", "--depth", "0"];
         let mut listener =
             networks.load_on(Site::Desk, "sub", "listener", &[&up[..], &["--verbose"]].concat());
-        let pace = ["--count", &count, "--rate", "50", "--wait-go", "--hold", "1"];
+        let pace = ["--count", &count, "--rate", "50", "--wait-go", "--begin", "1", "--hold", "1"];
         let second = SECOND.to_string();
         let starts: [&[&str]; 2] = [&[], &["--start", &second]];
         let mut talkers = [false, true].map(|on_zenoh| {
@@ -98,13 +106,11 @@ fn far_programs_hear_both_networks_of_a_robot_and_are_heard_on_both() {
         });
         listener.wait("both publishers", |event| event["event"] == "matched" && event["count"] == 2);
         talkers.iter_mut().for_each(Peer::go);
-        // A reader of DDS may be matched too late for the first message.
-        let expected = BTreeSet::from_iter((1..MESSAGES).chain(SECOND + 1..SECOND + MESSAGES));
-        let heard = heard_all(&mut listener, expected, &what);
+        assert_heard(&mut listener, &[0, SECOND], &what);
         talkers.iter_mut().for_each(|talker| drop(talker.summary()));
         listener.end();
         let summary = listener.summary();
-        assert!(heard <= 2 * MESSAGES && summary["duplicated"] == 0, "{what}: {summary}");
+        assert_eq!(summary["duplicated"], 0, "{what}: {summary}");
 
         let down = ["--topic", "/down", "--depth", "0"];
         let mut listeners = [false, true]
@@ -114,7 +120,7 @@ fn far_programs_hear_both_networks_of_a_robot_and_are_heard_on_both() {
         listeners.iter_mut().for_each(|listener| listener.wait_matched("a match of each subscriber"));
         talker.go();
         for listener in &mut listeners {
-            heard_all(listener, (1..MESSAGES).collect(), &what);
+            assert_heard(listener, &[0], &what);
         }
         talker.summary();
         for mut listener in listeners {
