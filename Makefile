@@ -16,7 +16,7 @@ CLIENTS := $(addprefix --test ,foxglove grpc otlp rosbridge)
 COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \
 	SGC_COMMIT_DATE=$${SGC_COMMIT_DATE-$$(git log -1 --format=%cs 2>/dev/null)}
 
-.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers peers-hiroz vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn zenoh-long stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-direct bench-zenoh bench-instructions bench-store bench-look-up scale bench-link-state clean-tools deps-bench bench-peers
+.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers peers-hiroz vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn dead-man zenoh-long stall fuzz soak gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-direct bench-zenoh bench-instructions bench-store bench-look-up scale bench-link-state clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--duration 10s --json")'
@@ -34,6 +34,7 @@ help:
 	@echo '                 peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
 	@echo '                 ring (two minutes of faults, without and with a store; SGC_RING_SEED, SGC_RING_SECONDS; SGC_RING_DIR keeps the logs)'
 	@echo '                 churn (200 random restarts; SGC_CHURN_SEED, SGC_CHURN_STEPS)'
+	@echo '                 dead-man (500 trials of a robot that has to stop; SGC_DEAD_MAN_TRIALS, SGC_DEAD_MAN_SEED)'
 	@echo '                 zenoh-long (100 restarts on networks of rmw_zenoh, and 10000 topics; SGC_ZENOH_RESTARTS, SGC_ZENOH_TOKENS)'
 	@echo '                 stall (ten minutes of images to a stalled subscriber; SGC_STALL_SECONDS)'
 	@echo '                 soak (20 nodes for two hours; SGC_SOAK_SECONDS, SGC_SOAK_SEED; SGC_SOAK_DIR keeps logs and samples; root)'
@@ -195,6 +196,12 @@ peers-check-long: peers
 ring: peers
 	SGC_RING_SEED=$${SGC_RING_SEED:-$$(date +%s)} SGC_RING_SECONDS=$${SGC_RING_SECONDS:-120} \
 		$(CARGO) test -p sgc $(FEATURES) --locked --test ring $(ARGS) -- --nocapture
+
+# Has a robot stop in five hundred random trials: cut cables, killed and frozen programs, clocks that are set. Prints the times.
+# The suite runs three.
+dead-man: peers
+	SGC_DEAD_MAN_SEED=$${SGC_DEAD_MAN_SEED:-$$(date +%s)} SGC_DEAD_MAN_TRIALS=$${SGC_DEAD_MAN_TRIALS:-500} \
+		$(CARGO) test -p sgc $(FEATURES) --locked --test ros2 $(ARGS) -- in_random_trials --nocapture
 
 # Restarts programs of rmw_zenoh a hundred times, and floods a network of theirs with ten thousand topics. The suite runs a short one.
 zenoh-long: peers

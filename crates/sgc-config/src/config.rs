@@ -252,6 +252,8 @@ pub struct ShareConfig {
     pub publish: Vec<Recipient>,
     /// Class of its packets.
     pub priority: Class,
+    /// Dead-man switch of what the others publish.
+    pub dead_man: Option<DeadManConfig>,
     /// Limits of rate, bandwidth and age.
     pub shaping: Shaping,
     /// QoS policies that replace those of its publishers.

@@ -147,6 +147,7 @@ pub(crate) struct ShareDraft {
     pub(crate) interface: Option<WithOrigin<String>>,
     pub(crate) unique: Option<WithOrigin<String>>,
     pub(crate) node: Option<WithOrigin<String>>,
+    pub(crate) dead_man: Option<DeadManDraft>,
     pub(crate) shaping: ShapingDraft,
     pub(crate) qos: QosDraft,
     pub(crate) naming: NamingDraft,
@@ -208,7 +209,7 @@ pub(crate) struct UseDraft {
     pub(crate) link: Option<WithOrigin<String>>,
 }
 
-/// `[use.deadman]`. Required fields are `None` only if an error was recorded.
+/// `[share.deadman]` and `[use.deadman]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug)]
 pub(crate) struct DeadManDraft {
     pub(crate) origin: Origin,

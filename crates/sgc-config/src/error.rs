@@ -1014,9 +1014,17 @@ pub enum Mistake {
         /// The pattern.
         topic: String,
     },
-    /// A frame prefix, or another setting of what comes here, for a topic that leaves this network.
+    /// A dead-man switch of a share on which nobody else publishes.
+    #[error(
+        "`{key}` is for commands that others publish: add them with `publish = [\"desk\"]`, or take it out"
+    )]
+    DeadManOfOwn {
+        /// The key.
+        key: &'static str,
+    },
+    /// A setting of what comes here, such as a frame prefix, for a topic that leaves this network.
     #[error("`{key}` is for what comes here: take it out, or `publish`")]
-    FramesElsewhere {
+    OnlyForWhatComes {
         /// The key.
         key: &'static str,
     },

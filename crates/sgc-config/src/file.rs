@@ -231,6 +231,8 @@ impl FileReader<'_> {
         const TEXT: &str = "a string";
         self.check_required(share, "topic", "\"/camera/image\"");
         self.check_required(share, "to", "[\"desk\", \"group:operators\"]");
+        let dead_man = self.single(share, "share.deadman", Table::ShareDeadMan);
+        let dead_man = dead_man.map(|table| self.dead_man(&table));
         let share = Some(share);
         ShareDraft {
             topic: self.interface(share),
@@ -250,6 +252,7 @@ impl FileReader<'_> {
             interface: self.string(share, "interface", TEXT),
             unique: self.string(share, "unique", TEXT),
             node: self.string(share, "node", TEXT),
+            dead_man,
             shaping: self.shaping(share),
             qos: self.qos(share),
             naming: self.naming(share),

@@ -358,6 +358,12 @@ impl Resolver<'_> {
         {
             self.record(&publish.origin, Mistake::PublishWithoutType { key: publish.key });
         }
+        let dead_man = share.dead_man.as_ref().and_then(|written| {
+            if share.publish.is_none() {
+                self.record(&written.origin, Mistake::DeadManOfOwn { key: "deadman" });
+            }
+            self.dead_man(written)
+        });
         let priority = share.priority.as_ref().and_then(|priority| self.keep(priority, priority_class));
         let dedicated = self.dedicated(share.link.as_ref());
         let suite = share.suite.as_ref().and_then(|name| self.keep(name, suite));
@@ -380,6 +386,7 @@ impl Resolver<'_> {
             publish: publish.unwrap_or_default(),
             type_name,
             priority: priority.unwrap_or_default(),
+            dead_man,
             shaping,
             qos,
             dedicated,
@@ -958,13 +965,13 @@ impl Resolver<'_> {
         let qos = self.qos(&one.qos);
         let dedicated = self.dedicated(one.link.as_ref());
         if let Some(written) = one.frame_prefix.as_ref().filter(|_| publish) {
-            self.record(&written.origin, Mistake::FramesElsewhere { key: written.key });
+            self.record(&written.origin, Mistake::OnlyForWhatComes { key: written.key });
         }
         let frame_prefix = self.frame_prefix(one);
         let dead_man = one.dead_man.as_ref().and_then(|written| {
             const KEY: &str = "deadman";
             if publish {
-                self.record(&written.origin, Mistake::FramesElsewhere { key: KEY });
+                self.record(&written.origin, Mistake::OnlyForWhatComes { key: KEY });
             }
             if interface != Interface::Topic {
                 self.record(&written.origin, Mistake::TopicsOnly { key: KEY, interface: interface.key() });

@@ -14,6 +14,8 @@ pub enum Table {
     Ros,
     /// `[ros.zenoh]`
     RosZenoh,
+    /// `[share.deadman]`
+    ShareDeadMan,
     /// `[use.deadman]`
     UseDeadMan,
     /// `[[share]]`
@@ -44,11 +46,12 @@ pub enum Table {
 
 impl Table {
     /// All tables, in the order of the reference.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 18] = [
         Self::Top,
         Self::Node,
         Self::Ros,
         Self::RosZenoh,
+        Self::ShareDeadMan,
         Self::UseDeadMan,
         Self::Share,
         Self::Use,
@@ -71,6 +74,7 @@ impl Table {
             Self::Node => "[node]",
             Self::Ros => "[ros]",
             Self::RosZenoh => "[ros.zenoh]",
+            Self::ShareDeadMan => "[share.deadman]",
             Self::UseDeadMan => "[use.deadman]",
             Self::Share => "[[share]]",
             Self::Use => "[[use]]",
@@ -131,7 +135,7 @@ impl Table {
                 "zenoh",
             ],
             Self::RosZenoh => &["router", "config"],
-            Self::UseDeadMan => &["after", "publish", "repeat", "resume"],
+            Self::ShareDeadMan | Self::UseDeadMan => &["after", "publish", "repeat", "resume"],
             Self::Share => &[
                 "topic",
                 "service",
@@ -155,6 +159,7 @@ impl Table {
                 "depth",
                 "deadline",
                 "lifespan",
+                "deadman",
                 "link",
                 "suite",
                 "description",
@@ -237,6 +242,7 @@ impl Table {
             Self::Top => &["profile"],
             Self::Ros
             | Self::RosZenoh
+            | Self::ShareDeadMan
             | Self::UseDeadMan
             | Self::Node
             | Self::Router
@@ -254,12 +260,12 @@ impl Table {
     }
 
     /// Returns the tables that have `key`, with the key. Tables within tables do not count: a `router` in `[node]` is
-    /// no misplaced `[router]`. Nor do the keys of `[ros.zenoh]` and `[use.deadman]`, whose words are too common.
+    /// no misplaced `[router]`. Nor do the keys of `[ros.zenoh]` and of dead-man switches, whose words are too common.
     pub(crate) fn homes(key: &str) -> Option<(&'static str, Vec<&'static str>)> {
         let has = |table: &&Self| {
             let counts = match table {
                 Self::Top => key == "identity",
-                Self::RosZenoh | Self::UseDeadMan => false,
+                Self::RosZenoh | Self::ShareDeadMan | Self::UseDeadMan => false,
                 _ => true,
             };
             counts && table.keys().contains(&key)

@@ -121,6 +121,7 @@ impl Stage {
     pub(crate) fn name_of(&self, topic: Topic) -> Result<Name, DemoError> {
         let owner: NodeName = topic.owner().name().parse()?;
         let share = ShareConfig {
+            dead_man: None,
             interface: Default::default(),
             topic: topic.ros_name().to_owned(),
             naming: Default::default(),

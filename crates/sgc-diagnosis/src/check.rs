@@ -108,6 +108,7 @@ pub fn summary(
             let publish: Vec<_> = share.publish.iter().map(ToString::to_string).collect();
             row("", format!("published on by {} besides", publish.join(", ")));
         }
+        share.dead_man.iter().flat_map(dead_man_rows).for_each(|(kind, text)| row(kind, text));
         if share.shaping.form == PayloadForm::Json {
             row("", json(config, share.type_name.as_deref()));
         }
@@ -121,14 +122,7 @@ pub fn summary(
         if one.shaping.form == PayloadForm::Json {
             row("", json(config, one.type_name.as_deref()));
         }
-        if let Some(switch) = &one.dead_man {
-            row("", dead_man(switch));
-            if let StopSource::File(file) = &switch.stop
-                && let Err(error) = read_stop(file)
-            {
-                row(WARNING, format!("the node will not start: {error}"));
-            }
-        }
+        one.dead_man.iter().flat_map(dead_man_rows).for_each(|(kind, text)| row(kind, text));
     }
     for token in &config.tokens {
         match &token.source {
@@ -137,6 +131,7 @@ pub fn summary(
                 row("uses", format!("{} from {}, by token", token.metadata.ros_name, token.owner_name));
             }
         }
+        token.dead_man.iter().flat_map(dead_man_rows).for_each(|(kind, text)| row(kind, text));
     }
     for partner in &config.partners {
         let nodes = match partner.nodes.len() {
@@ -202,6 +197,17 @@ pub fn summary(
         rows.push(vec![WARNING.to_owned(), format!("{alert}: {}", alert.fix())]);
     }
     Ok(rows)
+}
+
+/// Describes a dead-man switch, and tells if its stop message cannot be read.
+fn dead_man_rows(switch: &DeadManConfig) -> Vec<(&'static str, String)> {
+    let mut rows = vec![("", dead_man(switch))];
+    if let StopSource::File(file) = &switch.stop
+        && let Err(error) = read_stop(file)
+    {
+        rows.push((WARNING, format!("the node will not start: {error}")));
+    }
+    rows
 }
 
 /// Describes a dead-man switch.

@@ -315,15 +315,8 @@ pub(crate) enum UseFinding {
         messages: u64,
         /// Time since the last one, seconds.
         last_s: Option<u64>,
-    },
-    /// The dead-man switch has stopped the robot.
-    Stopped {
-        dead_man: DeadMan,
-        topic: String,
-    },
-    /// Commands pass the dead-man switch.
-    CommandsPass {
-        stops: u64,
+        /// Age of the last one that came, and the greatest error of that, microseconds.
+        age: Option<(i64, i64)>,
     },
     /// The local publishers have other types than the owner takes.
     TakesOther {
@@ -360,6 +353,15 @@ pub(crate) enum Reach {
 /// A fact about the local network.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum LocalFinding {
+    /// The dead-man switch has stopped the robot.
+    Stopped {
+        dead_man: DeadMan,
+        topic: String,
+    },
+    /// Commands pass the dead-man switch.
+    CommandsPass {
+        stops: u64,
+    },
     NoProvider {
         kind: Interface,
         topic: String,

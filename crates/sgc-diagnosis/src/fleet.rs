@@ -556,15 +556,10 @@ fn lost(link: &ReportLink) -> String {
     }
 }
 
-/// Returns the time from the publication of a topic's last message to its arrival. Clocks that differ make it negative.
+/// Returns the time from the publication of a topic's last message to its arrival. Clocks that differ make it negative,
+/// unless the node knows by how much.
 fn age(topic: &ReportTopic) -> String {
-    topic.age_us.map_or_else(
-        || "–".to_owned(),
-        |age_us| {
-            let sign = if age_us < 0 { "-" } else { "" };
-            format!("{sign}{}", output::millis(age_us.unsigned_abs()))
-        },
-    )
+    topic.age_us.map_or_else(|| "–".to_owned(), |age_us| output::signed_millis(age_us, topic.age_error_us))
 }
 
 /// Returns the drops of a topic with their reasons, the most first.

@@ -29,6 +29,8 @@ pub struct Status {
     /// Routers that the node dials or searches.
     pub routers: Vec<Router>,
     not_direct: Vec<NotDirect>,
+    #[serde(default)]
+    clocks: Vec<Clock>,
     pub(crate) port_mapping: PortMapping,
     /// Address of the host from which packets to the IPv6 internet leave.
     pub(crate) ipv6: Option<IpAddr>,
@@ -59,6 +61,17 @@ struct NotDirect {
     why: String,
     /// The remedy; empty if there is none to name.
     fix: String,
+}
+
+/// The clock of a node that messages come from.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct Clock {
+    name: String,
+    ahead_us: i64,
+    error_us: i64,
+    measured_s: u64,
+    steps: u32,
 }
 
 /// The port that a node's gateway maps for direct links. The state of an older node is empty.
@@ -232,6 +245,15 @@ impl Store {
     }
 }
 
+impl Clock {
+    fn row(&self) -> Vec<Toned> {
+        let ahead = output::signed_millis(self.ahead_us, Some(self.error_us));
+        let asked = format!("{} ago", duration(self.measured_s));
+        let set = if self.steps > 0 { output::several(u64::from(self.steps), "time") } else { String::new() };
+        [self.name.clone(), ahead, asked, set].map(Toned::from).into()
+    }
+}
+
 /// Asks the node at a socket for its status, for programs that show it in another way.
 pub fn query(socket: &Path) -> Result<Status, DiagnosisError> {
     parse(socket, &ask(socket, &AdminRequest::Status, ANSWER_MAX)?)
@@ -279,6 +301,10 @@ impl Status {
                 vec![name.as_str().into(), why.as_str().into(), fix.as_str().into()]
             });
             section("Over routers", &["peer", "why not direct", "do"], rows.collect());
+        }
+        if !self.clocks.is_empty() {
+            let rows = self.clocks.iter().map(Clock::row);
+            section("Clocks", &["peer", "ahead by", "asked", "was set"], rows.collect());
         }
         let over: Vec<_> = self.links.iter().filter(|l| l.peer_slowed + l.peer_dropped > 0).collect();
         if !over.is_empty() {

@@ -434,37 +434,16 @@ impl fmt::Display for UseFinding {
             ),
             Self::Answered { owner } => write!(f, "local clients are answered for {owner}"),
             Self::NoMessage { owner, .. } => write!(f, "nothing has come from {owner} yet"),
-            Self::Received { messages, last_s } => {
+            Self::Received { messages, last_s, age } => {
                 write!(f, "{messages} messages were given to the local network")?;
                 match last_s {
                     Some(0) => f.write_str(", the last one less than a second ago"),
                     Some(s) => write!(f, ", the last one {s} s ago"),
                     None => Ok(()),
-                }
-            }
-            Self::Stopped { dead_man, .. } => {
-                let cause = match dead_man.stopped.as_deref() {
-                    Some("silence") => "no command came",
-                    Some("late") => "commands came late",
-                    Some("closed") => "the topic's owner withdrew it",
-                    _ => "it began anew",
-                };
-                write!(f, "the dead-man switch stopped the robot {} s ago, because {cause}", dead_man.stopped_s)?;
-                if let Some(why) = &dead_man.no_stop_message {
-                    return write!(f, "; no command passes, because it has no stop message: {why}");
-                }
-                let held = [
-                    (dead_man.late, "late"),
-                    (dead_man.not_resumed, "of a publisher that has not let go since"),
-                    (dead_man.unjudged, "of a publisher that was new, or without a time stamp"),
-                ];
-                for (count, which) in held.into_iter().filter(|(count, _)| *count > 0) {
-                    write!(f, "; {count} commands were {which}")?;
-                }
-                Ok(())
-            }
-            Self::CommandsPass { stops } => {
-                write!(f, "commands pass the dead-man switch; it has published {stops} stop messages")
+                }?;
+                let Some((age_us, error_us)) = *age else { return Ok(()) };
+                let age = output::signed_millis(age_us, Some(error_us));
+                write!(f, "; the newest came {age} after its publication")
             }
             Self::TakesOther { owner, taken, types } => {
                 write!(f, "{owner} takes it as {taken}, and the local publishers have {}", types.join(", "))
@@ -511,17 +490,6 @@ impl UseFinding {
                 "on {owner}: add \"{node}\" to `to` of its [[share]]; or set publish = true in the [[use]]"
             ),
             Self::Idle { .. } => LOG_AND_STATUS.into(),
-            Self::Stopped { dead_man, .. } if dead_man.no_stop_message.is_some() => {
-                "name a directory with packages that define the type with `definitions` in [ros], or correct `publish` of `deadman`"
-                    .into()
-            }
-            Self::Stopped { dead_man, topic } if dead_man.is_manual => {
-                format!("look at the robot, then `sgc topic resume {topic}`")
-            }
-            Self::Stopped { topic, .. } => format!(
-                "let go of the control for the time of `after` and begin again; or look at the robot, then `sgc topic resume \
-                 {topic}`"
-            ),
             Self::NotForWildcards { owner, kind, rule, .. } => {
                 format!("on {owner}: no wildcard shares it; name it, [[share]] {kind} = \"{rule}\"")
             }
@@ -564,7 +532,6 @@ impl UseFinding {
             | Self::NotOverDirect { .. }
             | Self::Answered { .. }
             | Self::Received { .. }
-            | Self::CommandsPass { .. }
             | Self::Published { .. } => return None,
         })
     }
@@ -573,6 +540,34 @@ impl UseFinding {
 impl fmt::Display for LocalFinding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
+            Self::Stopped { dead_man, .. } => {
+                let cause = match dead_man.stopped.as_deref() {
+                    Some("silence") => "no command came",
+                    Some("late") => "commands came late",
+                    Some("closed") => "nobody publishes it any more",
+                    _ => "it began anew",
+                };
+                write!(
+                    f,
+                    "the dead-man switch stopped the robot {} s ago, because {cause}",
+                    dead_man.stopped_s
+                )?;
+                if let Some(why) = &dead_man.no_stop_message {
+                    return write!(f, "; no command passes, because it has no stop message: {why}");
+                }
+                let held = [
+                    (dead_man.late, "late"),
+                    (dead_man.not_resumed, "of a publisher that has not let go since"),
+                    (dead_man.unjudged, "of a publisher that was new, or without a time stamp"),
+                ];
+                for (count, which) in held.into_iter().filter(|(count, _)| *count > 0) {
+                    write!(f, "; {count} commands were {which}")?;
+                }
+                Ok(())
+            }
+            Self::CommandsPass { stops } => {
+                write!(f, "commands pass the dead-man switch; it has published {stops} stop messages")
+            }
             Self::NoProvider { kind, topic, consumers, meant } => {
                 write!(f, "no {} of {topic} is on the local network", provider(*kind))?;
                 if *consumers > 0 {
@@ -666,7 +661,21 @@ impl LocalFinding {
                  sourced; or take `encoding = \"json\"` out of the [[share]]"
                     .into()
             }
-            Self::Providers { .. } | Self::SomeQosDiffers { .. } | Self::Matched { .. } => return None,
+            Self::Stopped { dead_man, .. } if dead_man.no_stop_message.is_some() => {
+                "name a directory with packages that define the type with `definitions` in [ros], or correct `publish` of `deadman`"
+                    .into()
+            }
+            Self::Stopped { dead_man, topic } if dead_man.is_manual => {
+                format!("look at the robot, then `sgc topic resume {topic}`")
+            }
+            Self::Stopped { topic, .. } => format!(
+                "let go of the control for the time of `after` and begin again; or look at the robot, then `sgc topic resume \
+                 {topic}`"
+            ),
+            Self::Providers { .. }
+            | Self::SomeQosDiffers { .. }
+            | Self::Matched { .. }
+            | Self::CommandsPass { .. } => return None,
         })
     }
 }

@@ -266,6 +266,12 @@ impl Endpoint {
         }
     }
 
+    /// Tells the time by this node's clock to all who ask from here on.
+    pub fn offer_clock(&mut self, now: Now) {
+        self.cx.set_now(now);
+        self.owner.offer_clock(&self.cx);
+    }
+
     /// Iterates over the members that ask this authority: sink, node, and signing request.
     pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
         self.owner.renewing()
@@ -371,6 +377,19 @@ impl Endpoint {
     pub fn leave_path(&mut self, now: Now, peer: &NodeId) {
         self.cx.set_now(now);
         self.joiner.leave_path(&mut self.cx, peer);
+    }
+
+    /// Asks a node for the time by its clock, in place of an earlier question to it, until [`Self::leave_clock`]. A node
+    /// of a version that cannot tell it does not advertise the name of the question: then nothing happens.
+    pub fn ask_clock(&mut self, now: Now, peer: NodeId) {
+        self.cx.set_now(now);
+        self.joiner.ask_clock(&mut self.cx, peer);
+    }
+
+    /// Asks a node for its time no more.
+    pub fn leave_clock(&mut self, now: Now, peer: &NodeId) {
+        self.cx.set_now(now);
+        self.joiner.leave_clock(&mut self.cx, peer);
     }
 
     /// Iterates over the owners of the topics and services that this node joined and was granted, once for each of them.

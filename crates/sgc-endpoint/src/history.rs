@@ -90,9 +90,10 @@ pub(crate) struct History {
 }
 
 impl History {
-    /// Returns a history of `depth` messages of at most `bytes_max` for late joiners.
-    pub(crate) fn new(depth: usize, bytes_max: usize, recovery: RecoveryLimits) -> Self {
-        let tail = || Tail { from: 1, numbers: 0, messages: 0, bytes: 0 };
+    /// Returns a history of `depth` messages of at most `bytes_max` for late joiners. The first message has the number
+    /// `from`.
+    pub(crate) fn new(from: u64, depth: usize, bytes_max: usize, recovery: RecoveryLimits) -> Self {
+        let tail = || Tail { from, numbers: 0, messages: 0, bytes: 0 };
         Self { depth, bytes_max, recovery, kept: VecDeque::new(), late: tail(), recent: tail() }
     }
 
@@ -204,7 +205,7 @@ mod tests {
     use super::*;
 
     fn history(depth: usize, bytes_max: usize, messages_max: usize, recovery_bytes_max: usize) -> History {
-        History::new(depth, bytes_max, RecoveryLimits { messages_max, bytes_max: recovery_bytes_max })
+        History::new(1, depth, bytes_max, RecoveryLimits { messages_max, bytes_max: recovery_bytes_max })
     }
 
     fn push(history: &mut History, kind: MessageKind, bytes: usize) {

@@ -126,6 +126,26 @@ impl Joiner {
         self.leave(cx, &BlindName::paths(peer).name);
     }
 
+    /// Asks a node for the time by its clock, in place of an earlier question.
+    pub(crate) fn ask_clock(&mut self, cx: &mut Context, peer: NodeId) {
+        let BlindName { name, .. } = BlindName::clock(&peer);
+        let (now, post_quantum) = (cx.instant(), cx.identity().post_quantum());
+        let Some(join) = self.joins.get_mut(&name) else {
+            return self.join(cx, name, peer, JoinKind::Clock);
+        };
+        let leave = join.sink();
+        let request = join.ask(now, post_quantum, cx.rng());
+        send_leaves(cx, name, leave);
+        if let Some(request) = request {
+            send_request(cx, name, request);
+        }
+    }
+
+    /// Asks a node for its time no more.
+    pub(crate) fn leave_clock(&mut self, cx: &mut Context, peer: &NodeId) {
+        self.leave(cx, &BlindName::clock(peer).name);
+    }
+
     /// Iterates over the owners of the topics and services that this node joined.
     pub(crate) fn data_owners(&self) -> impl Iterator<Item = &VerifiedPeer> {
         let carries = |join: &&Join| {
@@ -277,6 +297,9 @@ impl Joiner {
             AnswerEffect::Granted { content, leave } => {
                 self.granted_content(cx, owner.node_id, name, sink, serial, content);
                 send_leaves(cx, name, leave);
+                // The next question for the time may come much later.
+                let clock = self.joins.get_mut(&name).filter(|join| matches!(join.kind(), JoinKind::Clock));
+                send_leaves(cx, name, clock.and_then(Join::finish));
             }
             AnswerEffect::Refused { reason, leave, was_granted } => {
                 send_leaves(cx, name, leave);
@@ -367,8 +390,8 @@ impl Joiner {
                     cx.event(Event::PathRefused { peer, by });
                 }
             }
-            // A missing description shows where it is needed.
-            (None, Some(JoinKind::Types(_) | JoinKind::Consumers)) => {}
+            // A missing answer shows where it is needed.
+            (None, Some(JoinKind::Types(_) | JoinKind::Consumers | JoinKind::Clock)) => {}
             (None, _) => cx.event(Event::Refused { name, by }),
         }
     }
@@ -404,6 +427,11 @@ impl Joiner {
             }
             (GrantContent::Path(offer), Some(JoinKind::Path(_))) => {
                 cx.event(Event::PathOffered { peer: owner, offer });
+            }
+            (GrantContent::Clock(time), Some(JoinKind::Clock)) => {
+                if let Some(asked) = self.joins.get(&name).and_then(Join::asked) {
+                    cx.event(Event::Time { peer: owner, asked, time });
+                }
             }
             (GrantContent::Types(types), Some(JoinKind::Types(names))) => {
                 let asked = |t: &DescribedType| names.contains(&t.name);

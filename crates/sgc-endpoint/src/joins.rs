@@ -89,6 +89,8 @@ pub enum JoinKind {
     Report(Bytes),
     /// To get a node's addresses: the answer to an encoded [`sgc_wire::PathQuestion`].
     Path(Bytes),
+    /// To get the time by a node's clock.
+    Clock,
 }
 
 impl JoinKind {
@@ -104,13 +106,21 @@ impl JoinKind {
                 let question = TypeQuestion { names: names.clone() };
                 Request::Ask { what: question.to_vec().into() }
             }
-            Self::Consumers => Request::Ask { what: Bytes::new() },
+            Self::Consumers | Self::Clock => Request::Ask { what: Bytes::new() },
         }
     }
 
     /// Returns whether one answer ends the join: no data flows, and no better route is looked for.
     pub(crate) fn is_question(&self) -> bool {
-        matches!(self, Self::Renew(_) | Self::Operate(_) | Self::Types(_) | Self::Report(_) | Self::Path(_))
+        match self {
+            Self::Subscribe { .. } | Self::Publish(_) | Self::Follow | Self::Consumers => false,
+            Self::Renew(_)
+            | Self::Operate(_)
+            | Self::Types(_)
+            | Self::Report(_)
+            | Self::Path(_)
+            | Self::Clock => true,
+        }
     }
 }
 
@@ -137,6 +147,8 @@ pub(crate) struct Join {
     reachable: Option<VerifiedPeer>,
     state: JoinState,
     attempts: u32,
+    /// Time of the last request.
+    asked: Option<Instant>,
 }
 
 /// State of a join, by the event that it waits for.
@@ -239,7 +251,7 @@ pub(crate) enum RejectEffect {
 
 impl Join {
     pub(crate) fn new(owner: NodeId, kind: JoinKind) -> Self {
-        Self { owner, kind, reachable: None, state: JoinState::ExpectAdvert, attempts: 0 }
+        Self { owner, kind, reachable: None, state: JoinState::ExpectAdvert, attempts: 0, asked: None }
     }
 
     pub(crate) fn owner(&self) -> NodeId {
@@ -248,6 +260,11 @@ impl Join {
 
     pub(crate) fn kind(&self) -> &JoinKind {
         &self.kind
+    }
+
+    /// Returns the time of the last request over the present route.
+    pub(crate) fn asked(&self) -> Option<Instant> {
+        self.asked
     }
 
     /// Returns the owner as its last advertisement proved it.
@@ -322,6 +339,7 @@ impl Join {
         let (sink, reply_key) = self.fresh_request(post_quantum, rng);
         let request = self.request(sink, &reply_key);
         self.attempts = self.attempts.saturating_add(1);
+        self.asked = Some(now);
         self.state = JoinState::ExpectAnswer { sink, reply_key, deadline: now + ANSWER_WAIT };
         Some(request)
     }
@@ -459,6 +477,13 @@ impl Join {
                 AnswerEffect::Unusable { why, leave: vec![sink] }
             }
         }
+    }
+
+    /// Ends a question that is answered, until it is asked again. Returns the branch to leave.
+    pub(crate) fn finish(&mut self) -> Option<SinkId> {
+        let sink = self.granted_sink()?;
+        self.state = JoinState::ExpectAdvert;
+        Some(sink)
     }
 
     /// Takes a router's rejection of the request or grant.

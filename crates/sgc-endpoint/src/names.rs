@@ -1,8 +1,8 @@
 //! The names at which a node is asked, apart from those of its shares.
 
 use sgc_trust::{
-    Identity, TopicSecret, consumers_blind, name_of, operations_blind, paths_blind, renewal_blind,
-    reports_blind, types_blind,
+    Identity, TopicSecret, clock_blind, consumers_blind, name_of, operations_blind, paths_blind,
+    renewal_blind, reports_blind, types_blind,
 };
 use sgc_wire::{Blind, Metadata, Name, NodeId};
 
@@ -36,6 +36,11 @@ impl BlindName {
     /// Returns the name at which `node` is asked for its addresses.
     pub(crate) fn paths(node: &NodeId) -> Self {
         Self::new(node, paths_blind(node))
+    }
+
+    /// Returns the name at which `node` is asked for the time by its clock.
+    pub(crate) fn clock(node: &NodeId) -> Self {
+        Self::new(node, clock_blind(node))
     }
 
     /// Returns the name at which members of `identity`'s fleet ask `authority` for credentials.

@@ -6,7 +6,7 @@ use std::time::Instant;
 use sgc_trust::{GrantError, SignedError};
 use sgc_wire::{
     Catalogue, Consumer, Control, Credentials, DescribedType, Name, NodeId, OperationAnswer, PathOffer,
-    Recover, RefuseReason, Report, Role, SinkId, SourceId, TopicGrant,
+    Recover, RefuseReason, Report, Role, SinkId, SourceId, TopicGrant, UnixMillis,
 };
 
 use crate::joins::{LostReason, RefusedBy};
@@ -159,6 +159,15 @@ pub enum Event {
         peer: NodeId,
         /// The refusing node, with the reason.
         by: RefusedBy,
+    },
+    /// A node told the time by its clock, some time between the question and now.
+    Time {
+        /// The node.
+        peer: NodeId,
+        /// Time of the question.
+        asked: Instant,
+        /// The time by the node's clock.
+        time: UnixMillis,
     },
     /// A member asked to follow what this node shares. The event repeats with each request of that member.
     Followed {

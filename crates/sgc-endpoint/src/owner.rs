@@ -19,7 +19,7 @@ use bytes::Bytes;
 use sgc_trust::{Kem, Policy, TopicSecret, VerifiedPeer, name_of, verify_join};
 use sgc_wire::{
     CatalogueSource, Consumer, Credentials, Decode, GrantContent, JoinBody, Name, NodeId, OperationAnswer,
-    PathOffer, Qos, Recover, RefuseReason, Report, SignedBody, SinkId, SourceId, TopicGrant,
+    PathOffer, Qos, Recover, RefuseReason, Report, Request, SignedBody, SinkId, SourceId, TopicGrant,
 };
 
 pub use self::adverts::{ADVERT_INTERVAL, ADVERTS_BURST};
@@ -61,6 +61,7 @@ enum Desk {
     Consumers,
     Reports,
     Paths,
+    Clock,
     Share,
 }
 
@@ -85,6 +86,8 @@ pub(crate) struct Owner {
     consumers: ConsumerReports,
     reports: MemberRequests,
     paths: MemberRequests,
+    /// The name at which this node tells the time, if it does.
+    clock: Option<BlindName>,
     /// Time of the next look for expired certificates.
     enforce_at: Option<Instant>,
 }
@@ -106,6 +109,7 @@ impl Owner {
             consumers: ConsumerReports::new(&own),
             reports: MemberRequests::new(None, REPORTS_ASKED_MAX),
             paths: MemberRequests::new(None, PATHS_ASKED_MAX).with_partners(),
+            clock: None,
             enforce_at: None,
         };
         owner.advertise_all();
@@ -200,6 +204,7 @@ impl Owner {
         self.consumers.withdraw(&mut self.adverts);
         self.withhold_reports();
         self.withhold_paths();
+        self.clock.take().into_iter().for_each(|name| self.adverts.withdraw(name.blind));
         self.enforce_at = None;
         self.catalogue.end_rest();
     }
@@ -285,6 +290,14 @@ impl Owner {
         self.paths.end().into_iter().for_each(|blind| self.adverts.withdraw(blind));
     }
 
+    /// Tells the time by this node's clock to all who ask from here on.
+    pub(crate) fn offer_clock(&mut self, cx: &Context) {
+        let name = BlindName::clock(&cx.identity().node_id());
+        if self.clock.replace(name).is_none() {
+            self.adverts.add(name.blind);
+        }
+    }
+
     /// Iterates over the members that ask this authority: sink, node, and signing request.
     pub(crate) fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
         self.renewals.iter()
@@ -333,7 +346,8 @@ impl Owner {
         let consumers = self.consumers.is_advertised().then(|| self.consumers.name().blind);
         let asked = [&self.renewals, &self.operations, &self.reports, &self.paths];
         let asked = asked.into_iter().filter_map(MemberRequests::blind);
-        let fixed = self.catalogue.blinds().chain(asked).chain(types).chain(consumers);
+        let clock = self.clock.map(|name| name.blind);
+        let fixed = self.catalogue.blinds().chain(asked).chain(types).chain(consumers).chain(clock);
         self.adverts.add_all(fixed.chain(self.shares.iter().map(Share::blind)));
     }
 
@@ -448,6 +462,7 @@ impl Owner {
                     cx.event(Event::PathAsked { sink, peer, question });
                 }
             }
+            Some(Desk::Clock) => tell_time(cx, name, sink, asked),
             Some(Desk::Types) => self.types.handle_question(cx, &self.shares, sink, asked),
             Some(Desk::Consumers) => self.consumers.handle_question(cx, sink, asked),
             Some(Desk::Share) => {
@@ -470,6 +485,8 @@ impl Owner {
             Some(Desk::Operations) => self.operations.handle_leave(sink),
             Some(Desk::Reports) => self.reports.handle_leave(sink),
             Some(Desk::Paths) => self.paths.handle_leave(sink),
+            // Each question was answered at once.
+            Some(Desk::Clock) => {}
             Some(Desk::Types) => self.types.handle_leave(sink),
             Some(Desk::Consumers) => self.consumers.handle_leave(sink),
             Some(Desk::Share) => {
@@ -507,6 +524,8 @@ impl Owner {
             Some(Desk::Reports)
         } else if self.paths.is_at(name) {
             Some(Desk::Paths)
+        } else if self.clock.is_some_and(|own| own.name == *name) {
+            Some(Desk::Clock)
         } else if self.types.name().name == *name {
             Some(Desk::Types)
         } else if self.consumers.name().name == *name {
@@ -515,6 +534,15 @@ impl Owner {
             self.shares.contains(name).then_some(Desk::Share)
         }
     }
+}
+
+/// Answers a question for the time. No asker has a place, since nothing follows.
+fn tell_time(cx: &mut Context, name: Name, sink: SinkId, mut asked: GrantedSink) {
+    let Request::Ask { .. } = asked.request else {
+        return cx.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
+    };
+    let time = GrantContent::Clock(cx.now().unix);
+    asked.grant(cx, name, sink, &time);
 }
 
 /// Returns the names of this node's catalogue.

@@ -69,6 +69,8 @@ pub struct SourceProgress {
     key: Bytes,
     /// Whether lost messages can be asked for.
     recovers: bool,
+    /// The number of its first message.
+    first: u64,
     next: AtomicU64,
     oldest: AtomicU64,
     /// The last number that is no mark.
@@ -84,7 +86,7 @@ impl SourceProgress {
         // Both only grow, `next` first: read the other way round, the oldest is never beyond the next.
         let oldest = self.oldest.load(Acquire);
         let next = self.next.load(Acquire);
-        let recover = u64::from(self.recovers);
+        let recover = if self.recovers { self.first } else { 0 };
         SourceAnnounce { source: self.source, key: self.key.clone(), oldest, next, recover }
     }
 
@@ -105,7 +107,7 @@ impl SourceProgress {
 
     /// Returns the number of published messages and marks.
     pub fn published(&self) -> u64 {
-        self.next.load(Acquire).saturating_sub(1)
+        self.next.load(Acquire).saturating_sub(self.first)
     }
 
     /// Returns the number of the last message that is no mark: a larger one ends a silence.
@@ -163,6 +165,21 @@ impl Source {
     ///
     /// Never make two sources under one id with one topic key: their nonces would repeat.
     pub fn new(config: SourceConfig, grant: &TopicGrant, message_key: MessageKey) -> Option<Self> {
+        Self::from_number(1, config, grant, message_key)
+    }
+
+    /// Does the same for a publisher of which this node may not have heard the first messages: the source starts at
+    /// message 2. So a receiver knows of which publishers message 1 is the first one that there ever was.
+    pub fn midway(config: SourceConfig, grant: &TopicGrant, message_key: MessageKey) -> Option<Self> {
+        Self::from_number(2, config, grant, message_key)
+    }
+
+    fn from_number(
+        first: u64,
+        config: SourceConfig,
+        grant: &TopicGrant,
+        message_key: MessageKey,
+    ) -> Option<Self> {
         let key = SourceKey::derive(grant, &config.name, &config.id)?;
         let suite = key.suite();
         if !message_key.fits(suite) {
@@ -172,21 +189,22 @@ impl Source {
             source: config.id,
             key: message_key.public().clone(),
             recovers: config.reliable && config.recovery.messages_max > 0,
-            next: AtomicU64::new(1),
-            oldest: AtomicU64::new(1),
+            first,
+            next: AtomicU64::new(first),
+            oldest: AtomicU64::new(first),
             last_message: AtomicU64::new(0),
             epoch_start: AtomicU64::new(0),
             signatures: AtomicU64::new(0),
         };
         let recovery = if progress.recovers { config.recovery } else { RecoveryLimits::NONE };
-        let history = History::new(config.history_depth, config.history_bytes_max, recovery);
+        let history = History::new(first, config.history_depth, config.history_bytes_max, recovery);
         Some(Self {
             config,
             suite,
             grant: without_lists(grant),
             key,
             message_key,
-            seq: 0,
+            seq: first - 1,
             batch: Batch::default(),
             unsigned: Vec::new(),
             macs: Vec::new(),
@@ -210,7 +228,7 @@ impl Source {
         self.macs.clear();
         self.key = key;
         self.grant = without_lists(grant);
-        self.progress.epoch_start.store(self.seq, Release);
+        self.progress.epoch_start.store(self.progress.published(), Release);
         true
     }
 
@@ -290,7 +308,7 @@ impl Source {
 
     fn publish_mark(&mut self, head: &MessageHead, mut emit: impl FnMut(Packet)) {
         self.flush(&mut emit);
-        if !self.progress.recovers || self.seq == 0 || self.seq >= SOURCE_MESSAGES_MAX {
+        if !self.progress.recovers || self.progress.published() == 0 || self.seq >= SOURCE_MESSAGES_MAX {
             return;
         }
         self.seal_mark(head, &mut emit);

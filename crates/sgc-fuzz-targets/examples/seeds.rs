@@ -287,6 +287,7 @@ fn bodies() -> Vec<Vec<u8>> {
     let password = SecretBytes::new([5; 32]);
     let offer = PathOffer { attempt: 1, user: [2; 4], password, candidates: vec![candidate] };
     all.push((3, GrantContent::Path(offer).to_vec()));
+    all.push((3, GrantContent::Clock(NOW).to_vec()));
     all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
 }
 

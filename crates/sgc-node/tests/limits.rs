@@ -144,6 +144,7 @@ fn commands_overtake_images_on_a_full_link() {
     let desk = trio.desk(&["/image", "/video", "/cmd_vel"]);
     trio.port = narrow(trio.port, 40_000_000);
     let share = |(topic, priority): (&str, Class)| ShareConfig {
+        dead_man: None,
         interface: Default::default(),
         topic: topic.into(),
         naming: Default::default(),

@@ -76,8 +76,8 @@ fn names_get_labels_on_every_link_that_they_cross() {
         let listener = Listener::new(&trio.desk_net, topic, Qos::default());
         talker.wait_for_readers(1);
         listener.hears_at_last(|n| talker.say(format!("warm {n}")));
-        // The catalogue has a source, too.
-        let n = index as u64 + 2;
+        // The catalogue and the robot's clock have one for the life of a link, too.
+        let n = index as u64 + 3;
         wait("labels", || labels(&robot, "labels_sent") == n && labels(&cloud, "labels_sent") == n);
         assert_eq!((labels(&desk, "labels_received"), labels(&desk, "labels_sent")), (n, 0));
         talker.say("under a label");
@@ -247,8 +247,8 @@ fn a_clean_stop_withdraws_at_once_and_a_new_share_appears() {
     assert!(begun.elapsed() < sgc_ros::UNREACHABLE_HOLD, "it was not withdrawn, it expired");
     wait("nothing left in the router", || {
         let router = &cloud.status()["router"];
-        // Desk and router each have a name for reports, and the desk one for type questions.
-        router["branches"] == 0 && router["routed_names"] == 3
+        // Desk and router each have a name for reports, and the desk one for questions about types and one for its clock.
+        router["branches"] == 0 && router["routed_names"] == 4
     });
     desk.stop();
     wait("only its own name left in the router", || cloud.status()["router"]["names"] == 1);
@@ -296,8 +296,9 @@ fn status_names_links_and_routes() {
     assert_eq!(status["node"], "robot");
     let never = status["routes"].as_array().unwrap().iter().find(|r| r["topic"] == "/never").unwrap();
     assert_eq!(never["state"], "waits for a local publisher");
-    // The names include the catalogue, the robot's name for type questions, and those of both for reports.
-    wait("chatter is routed", || cloud.status()["router"]["routed_names"] == 5);
+    // The names include the catalogue, the robot's names for questions about types and for its clock, and those of both for
+    // reports.
+    wait("chatter is routed", || cloud.status()["router"]["routed_names"] == 6);
     // The document has the form of `Status`.
     let _: fn(Status) -> serde_json::Value = |s| serde_json::to_value(s).unwrap();
 }

@@ -140,6 +140,7 @@ impl Way {
         let cloud = Config { routers: vec![], listen: vec![addr], ..config("cloud") };
         let cloud = Node::start(cloud, identity("cloud", true), None);
         let share = ShareConfig {
+            dead_man: None,
             interface: Default::default(),
             topic: TOPIC.into(),
             naming: Default::default(),

@@ -138,6 +138,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
     let url = format!("quic://{}", cloud.listens[0].addr);
 
     let share = ShareConfig {
+        dead_man: None,
         interface: Default::default(),
         topic: TOPIC.into(),
         naming: Default::default(),

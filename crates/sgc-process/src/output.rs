@@ -75,6 +75,13 @@ pub fn millis(us: u64) -> String {
     if ms < 10.0 { format!("{ms:.2} ms") } else { format!("{ms:.0} ms") }
 }
 
+/// Formats microseconds as milliseconds, with the greatest error if it is known: `-1.24 ms ± 0.50 ms`.
+pub fn signed_millis(us: i64, error_us: Option<i64>) -> String {
+    let sign = if us < 0 { "-" } else { "" };
+    let error = error_us.map_or(String::new(), |error| format!(" ± {}", millis(error.unsigned_abs())));
+    format!("{sign}{}{error}", millis(us.unsigned_abs()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

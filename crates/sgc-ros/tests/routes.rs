@@ -8,10 +8,11 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_ros::{
-    ANNOUNCED_EVERY, AnnouncedPublishers, Command, Direction, DiscoveredEndpoint, DiscoveryEvent,
-    EndpointKind, GraphNode, Guid, HEARD_MIN, LocalEnd, Naming, OwnerState, Problem, QosOverride,
-    REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, RouteState, Routes, SINKLESS_HOLD, Shaping, ShareRule,
-    UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
+    ANNOUNCED_EVERY, AnnouncedPublishers, Command, DeadManRule, Direction, DiscoveredEndpoint,
+    DiscoveryEvent, EndpointKind, GraphNode, Guid, HEARD_MIN, LocalEnd, Naming, OwnerState, Problem,
+    QosOverride, REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, Resume, RouteState, Routes,
+    SINKLESS_HOLD, Shaping, ShareRule, StopMessage, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic,
+    dds_type,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
@@ -45,6 +46,7 @@ fn bench_of(shares: Vec<ShareRule>, uses: Vec<UseRule>) -> Bench {
 
 fn share(topic: &str, type_name: &str) -> ShareRule {
     ShareRule {
+        dead_man: None,
         metadata: Metadata::topic("me", topic, type_name),
         naming: Naming::default(),
         policy: Policy::default(),
@@ -1069,6 +1071,32 @@ fn writer_for_messages_of_others_offers_what_they_announced() {
     b.routes.handle_publishers(&name, false);
     b.routes.handle_publishers(&name, true);
     assert_eq!(writer_commands(b.commands()), opens);
+}
+
+#[test]
+fn a_share_with_a_dead_man_switch_has_a_writer_whether_others_publish_or_not() {
+    let (after, stop, resume) = (Duration::from_secs(1), StopMessage::Zero, Resume::Auto);
+    let switch = DeadManRule { after, stop, repeat: None, resume };
+    let rule = ShareRule { dead_man: Some(switch.clone()), ..inbound("/cmd") };
+    let mut b = bench_of(vec![rule.clone()], Vec::new());
+    let name = mine("/cmd");
+    let commands = b.commands();
+    let sets = Command::DeadMan { name, rule: Some(switch) };
+    let place = |of: &Command| commands.iter().position(|command| command == of);
+    let [Command::OpenWriter { spec, .. }] = &writer_commands(commands.clone())[..] else {
+        panic!("{commands:?}")
+    };
+    let opens = Command::OpenWriter { name, source: None, spec: spec.clone() };
+    assert!(place(&sets).is_some() && place(&sets) < place(&opens), "{commands:?}");
+    for any in [true, false] {
+        b.routes.handle_publishers(&name, any);
+        assert_eq!(writer_commands(b.commands()), []);
+    }
+    // Without a switch, the writer goes with the last publisher.
+    let commands = b.reconfigured(vec![inbound("/cmd")], Vec::new());
+    let closes = Command::CloseWriter { name, source: None };
+    assert_eq!(commands, [Command::DeadMan { name, rule: None }, closes]);
+    assert_eq!(writer_commands(b.reconfigured(vec![rule], Vec::new())), [opens]);
 }
 
 #[test]

@@ -35,6 +35,7 @@ fn served() -> (Routes<ChaCha8Rng>, Name) {
     let mut policy = Policy::default();
     policy.publish.nodes.insert(OWNER);
     let rule = ShareRule {
+        dead_man: None,
         metadata: Metadata { type_name: String::new(), ..metadata("me", Kind::Service) },
         naming: Naming::default(),
         policy,

@@ -8,7 +8,9 @@
 //! the delay itself is unknown. The arrival is read from a monotonic clock; a publisher's clock that is set back makes its
 //! commands late, and one that is set forward does not. The first commands of a source may be those that waited during an
 //! outage, each faster than the one before, so a source is only believed once it has been heard for `after` without a gap.
-//! Nothing shows that commands are late if all commands of a publisher were, from its first on.
+//! If the clock of the publisher's node is known ([`crate::PeerClocks`]), a command is also late if it is older than that by
+//! its time stamp. Without that clock, nothing shows that commands are late if all commands of a publisher were, from its
+//! first on.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -16,10 +18,10 @@ use std::time::{Duration, Instant};
 use sgc_ros::{DeadManRule, Resume};
 use sgc_wire::SourceId;
 
+use crate::clocks::DRIFT_DIVISOR;
+
 /// Most sources that are remembered.
 const SOURCES_MAX: usize = 128;
-/// Rate at which the least time to arrival rises by itself, as a divisor: 200 ppm, twice what clocks of computers differ.
-const DRIFT_DIVISOR: i64 = 5_000;
 
 /// The facts of a command by which the switch judges it.
 #[derive(Clone, Copy, Debug)]
@@ -30,6 +32,8 @@ pub struct Command {
     pub seq: u64,
     /// The publisher's time stamp in ns since 1970; 0 if there is none.
     pub stamp_ns: i64,
+    /// Its age in ns at least, by the clock of the publisher's node; `None` while that clock is not known.
+    pub least_age: Option<i64>,
     /// Whether it is the stop message.
     pub is_stop: bool,
 }
@@ -254,7 +258,8 @@ impl DeadMan {
             (stream.least_ns, stream.measured) = (took, now);
         }
         let late_ns = took.saturating_sub(least).max(0);
-        let is_late = late_ns > nanos(after);
+        let is_old = command.least_age.is_some_and(|age| age > nanos(after));
+        let is_late = is_old || late_ns > nanos(after);
         // Lost commands are no pause, so the command before this one must have come. A publisher's clock that is set
         // forward is none either, so the pause must show in the arrivals as well.
         let pause_ns = command.stamp_ns.saturating_sub(stream.stamp_ns);
@@ -334,7 +339,7 @@ mod tests {
             self.switch.tick(self.at(came));
             self.seq += 1;
             let stamp_ns = 1_000_000_000_000_000_000 + published as i64 * 1_000_000;
-            let command = Command { source: PUBLISHER, seq: self.seq, stamp_ns, is_stop };
+            let command = Command { source: PUBLISHER, seq: self.seq, stamp_ns, least_age: None, is_stop };
             self.switch.judge(self.at(came), command)
         }
 
@@ -477,8 +482,30 @@ mod tests {
     #[test]
     fn commands_without_a_time_do_not_pass() {
         let mut switch = DeadMan::new(&rule(Resume::Auto, None), Instant::now());
-        let command = Command { source: PUBLISHER, seq: 1, stamp_ns: 0, is_stop: true };
+        let command = Command { source: PUBLISHER, seq: 1, stamp_ns: 0, least_age: None, is_stop: true };
         assert_eq!(switch.judge(Instant::now(), command), Err(CommandRefusal::Unjudged));
+    }
+
+    #[test]
+    fn commands_that_are_old_by_a_known_clock_never_pass() {
+        let mut bench = Bench::new(Resume::Auto, None);
+        assert!(bench.tick(0));
+        let mut command = |at: u64, least_age_ms: i64| {
+            bench.switch.tick(bench.begin + ms(at));
+            bench.seq += 1;
+            let (seq, stamp_ns) = (bench.seq, 1_000_000_000_000_000_000 + at as i64 * 1_000_000);
+            let least_age = Some(least_age_ms * 1_000_000);
+            let command = Command { source: PUBLISHER, seq, stamp_ns, least_age, is_stop: false };
+            bench.switch.judge(bench.begin + ms(at), command)
+        };
+        // All took equally long from the first on.
+        for at in (0..1000).step_by(20) {
+            assert_eq!(command(at, 301), Err(CommandRefusal::Late));
+        }
+        // So did these, and not too long. Somebody let go before.
+        assert_eq!(command(1400, 300), Ok(()));
+        assert_eq!(command(1420, -5), Ok(()));
+        assert_eq!(command(1440, 301), Err(CommandRefusal::Late));
     }
 
     #[test]
@@ -496,7 +523,8 @@ mod tests {
         let begin = Instant::now();
         let mut switch = DeadMan::new(&rule(Resume::Auto, None), begin);
         for n in 0..10_000_u128 {
-            let command = Command { source: SourceId(n.to_be_bytes()), seq: 1, stamp_ns: 1, is_stop: false };
+            let source = SourceId(n.to_be_bytes());
+            let command = Command { source, seq: 1, stamp_ns: 1, least_age: None, is_stop: false };
             assert!(switch.judge(begin + ms(n as u64), command).is_err());
         }
         assert_eq!(switch.sources.len(), SOURCES_MAX);
@@ -529,9 +557,12 @@ mod tests {
 
     /// Runs a history of 30 s. Whenever no command passed for `AFTER`, the stop message was published; no command passes
     /// that is older than the path's usual delay and `AFTER`; and after a stop none passes of a hold that began before it.
-    fn run(seed: u64) -> (usize, usize) {
+    /// If the publisher's clock is known, none passes that is older than `AFTER` and the error of that.
+    fn run(seed: u64, knows_clock: bool) -> (usize, usize) {
         const DELAY: u64 = 20;
         const JITTER: u64 = 30;
+        const ERROR: u64 = 10;
+        let age_max = AFTER.as_millis() as u64 + if knows_clock { ERROR } else { DELAY + JITTER };
         let mut history = History { rng: ChaCha8Rng::seed_from_u64(seed), way: Vec::new() };
         let begin = Instant::now();
         let at = |ms: u64| begin + Duration::from_millis(ms);
@@ -552,13 +583,13 @@ mod tests {
                 changes = now + 350 + history.below(3000);
             }
             // How long commands take is not known of a publisher of which each one waited.
-            if now >= calm_until && history.is_one_in(4000) {
+            if (now >= calm_until || knows_clock) && history.is_one_in(4000) {
                 outage_until = now + history.below(3000);
                 calm_until = outage_until + 500;
             }
             // A clock that is set while no command arrives hides how long the next ones took.
             let is_heard = (is_held || streams_stops) && now >= outage_until + 100 && changes > now + 200;
-            if is_heard && history.is_one_in(8000) {
+            if is_heard && !knows_clock && history.is_one_in(8000) {
                 skew += history.below(5000) as i64 - 2500;
                 calm_until = calm_until.max(now + 200);
             }
@@ -574,7 +605,7 @@ mod tests {
             if now % 20 == 0 && (is_held || streams_stops) {
                 seq += 1;
                 let stamp_ns = (1 << 60) + (now as i64 + skew) * 1_000_000;
-                let command = Command { source, seq, stamp_ns, is_stop: !is_held };
+                let command = Command { source, seq, stamp_ns, least_age: None, is_stop: !is_held };
                 let delay = DELAY + history.below(JITTER);
                 let arrives = if now < outage_until { outage_until + DELAY } else { now + delay };
                 let is_lost = history.is_one_in(50) || now < outage_until;
@@ -586,12 +617,13 @@ mod tests {
             history.way = way;
             for sent in come {
                 heard_hold = Some(sent.hold);
-                if switch.judge(at(now), sent.command).is_err() {
+                let age = now - sent.published;
+                let least_age = knows_clock.then_some((age as i64 - ERROR as i64) * 1_000_000);
+                if switch.judge(at(now), Command { least_age, ..sent.command }).is_err() {
                     continue;
                 }
                 (passed, last_passed) = (passed + 1, now);
-                let age = now - sent.published;
-                assert!(age <= DELAY + JITTER + AFTER.as_millis() as u64, "at {now}: {age} ms old");
+                assert!(age <= age_max, "at {now}: {age} ms old");
                 if sent.command.is_stop {
                     is_stopped = false;
                 } else {
@@ -614,7 +646,7 @@ mod tests {
     fn in_random_histories_a_stop_is_never_late_and_no_stale_command_passes() {
         let (mut passed, mut stops) = (0, 0);
         for seed in 0..500 {
-            let one = std::panic::catch_unwind(|| run(seed));
+            let one = std::panic::catch_unwind(|| run(seed, seed % 2 == 1));
             let (p, s) = one.unwrap_or_else(|_| panic!("seed {seed}"));
             (passed, stops) = (passed + p, stops + s);
         }

@@ -9,6 +9,7 @@ mod backoff;
 mod bulk;
 mod candidates;
 mod claims;
+mod clocks;
 mod dead_man;
 mod direct;
 mod failback;
@@ -26,6 +27,7 @@ pub use bulk::{
 };
 pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates, is_of_host};
 pub use claims::ClaimTable;
+pub use clocks::{ClockBounds, ClockOutput, PEER_CLOCKS_MAX, PeerClocks};
 pub use dead_man::{Command, CommandRefusal, DeadMan, StopCause};
 pub use direct::{
     DIRECT_ATTEMPT_MAX, DIRECT_ATTEMPTS_MAX, DIRECT_PEERS_MAX, DirectLinkTable, DirectOutput, DirectPaths,

@@ -562,6 +562,26 @@ impl World {
         self.settle(node);
     }
 
+    /// Lets a node tell its time.
+    pub fn offer_clock(&mut self, node: NodeKey) {
+        self.note(format!("offer clock {node:?}"));
+        let now = self.now_at(node);
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.offer_clock(now);
+        }
+        self.settle(node);
+    }
+
+    /// Asks another node for its time, once more if it did before.
+    pub fn ask_clock(&mut self, node: NodeKey, other: NodeKey) {
+        self.note(format!("ask clock {node:?} {other:?}"));
+        let (now, id) = (self.now_at(node), self.identity(other).node_id());
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.ask_clock(now, id);
+        }
+        self.settle(node);
+    }
+
     /// Lets a node take questions for reports, or no more.
     pub fn offer_reports(&mut self, node: NodeKey, is_offered: bool) {
         self.note(format!("offer reports {node:?} {is_offered}"));

@@ -68,8 +68,8 @@ pub use label::{FleetName, GROUPS_MAX, GroupName, LABEL_BYTES_MAX, LabelError, N
 pub use member::Membership;
 pub use message_key::{MessageKey, MessageKeyError};
 pub use names::{
-    TopicSecret, consumers_blind, derive_name, name_of, operations_blind, paths_blind, renewal_blind,
-    reports_blind, types_blind,
+    TopicSecret, clock_blind, consumers_blind, derive_name, name_of, operations_blind, paths_blind,
+    renewal_blind, reports_blind, types_blind,
 };
 pub use peer::{SignatureError, VerifiedPeer, node_id};
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};

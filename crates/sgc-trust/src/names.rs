@@ -107,6 +107,11 @@ pub fn paths_blind(node: &NodeId) -> Blind {
     blind_of(b"sgc paths v1", &node.0)
 }
 
+/// Returns the blind for questions to a node about its clock: everyone who knows the node can derive it.
+pub fn clock_blind(node: &NodeId) -> Blind {
+    blind_of(b"sgc clock v1", &node.0)
+}
+
 /// Returns `SHA-256(label ‖ id)`, a blind that needs no secret.
 fn blind_of(label: &[u8], id: &[u8]) -> Blind {
     let mut context = digest::Context::new(&digest::SHA256);

@@ -115,6 +115,14 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
         name_of(&owner, &paths_blind(&owner)).to_string(),
         "79ba6d7f59ef5801396d45bb59b96e1892070495b1e9c27d9f5a768c901b4df2"
     );
+    assert_eq!(
+        clock_blind(&owner).to_string(),
+        "35ee76155e29ba1dac7c4c94a0a4acdfc360442893a5c2b75bade00f0e575e76"
+    );
+    assert_eq!(
+        name_of(&owner, &clock_blind(&owner)).to_string(),
+        "26150ea05f92931e372e3b3227e64e7b399bd4122e6576104a2b507e33def622"
+    );
 }
 
 #[test]

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
 use crate::consumers::{CONSUMERS_MAX, Consumer};
 use crate::control::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, SOURCE_KEY_BYTES_MAX};
-use crate::ids::{Blind, SecretBytes, SourceId};
+use crate::ids::{Blind, SecretBytes, SourceId, UnixMillis};
 use crate::metadata::Metadata;
 use crate::operation::OperationAnswer;
 use crate::packet::Class;
@@ -49,6 +49,8 @@ pub enum GrantContent {
     Report(Report),
     /// Where a node can be reached without a router.
     Path(PathOffer),
+    /// The time by a node's clock.
+    Clock(UnixMillis),
 }
 
 /// One epoch of one topic.
@@ -223,6 +225,10 @@ impl Encode for GrantContent {
                 w.u8(7);
                 offer.encode(w);
             }
+            Self::Clock(time) => {
+                w.u8(8);
+                time.encode(w);
+            }
         }
     }
 }
@@ -257,6 +263,7 @@ impl Decode for GrantContent {
             5 => Ok(Self::Consumers(r.list("consumers", CONSUMERS_MAX, Consumer::decode)?)),
             6 => Ok(Self::Report(Report::decode(r)?)),
             7 => Ok(Self::Path(PathOffer::decode(r)?)),
+            8 => Ok(Self::Clock(UnixMillis::decode(r)?)),
             v => Err(DecodeError::value("grant content", v.into())),
         }
     }
@@ -344,6 +351,14 @@ mod tests {
     use super::*;
     use crate::ids::Name;
     use crate::message::PayloadEncoding;
+
+    /// The bytes are normative.
+    #[test]
+    fn a_time_has_these_bytes() {
+        let content = GrantContent::Clock(UnixMillis(0x0102_0304_0506));
+        assert_eq!(content.to_vec(), [8, 0, 0, 1, 2, 3, 4, 5, 6]);
+        assert_eq!(GrantContent::from_slice(&content.to_vec()), Ok(content));
+    }
 
     #[test]
     fn grants_round_trip_and_keys_stay_out_of_debug() {

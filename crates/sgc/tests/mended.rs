@@ -15,6 +15,7 @@ use std::process::Command;
 use dns::DnsServer;
 use serde_json::Value;
 use sgc_testkit::netsim::Namespace;
+use support::fake_clock::FakeClock;
 use support::{Running, eventually, own_network, say_log};
 use tempfile::TempDir;
 
@@ -31,14 +32,14 @@ const USED: &str = "/far";
 struct Place {
     dir: TempDir,
     network: Option<Namespace>,
-    /// Whether the desk has a clock of its own: the file `clock` has its offset, which libfaketime reads.
-    has_clock: bool,
+    /// The desk's clock, if it has one of its own.
+    clock: Option<FakeClock>,
 }
 
 impl Place {
     fn new(test: &str) -> Self {
         let network = own_network(format!("sgcmend-{}-{test}", std::process::id()));
-        Self { dir: tempfile::tempdir().unwrap(), network, has_clock: false }
+        Self { dir: tempfile::tempdir().unwrap(), network, clock: None }
     }
 
     /// Makes the fleet.
@@ -54,10 +55,10 @@ impl Place {
     }
 
     fn set_clock(&mut self, offset: &str) {
-        self.has_clock = true;
-        // Whole: the desk reads it all the time.
-        fs::write(self.file("clock.new"), offset).unwrap();
-        fs::rename(self.file("clock.new"), self.file("clock")).unwrap();
+        match &self.clock {
+            Some(clock) => clock.set(offset),
+            None => self.clock = Some(FakeClock::new(self.dir.path(), offset)),
+        }
     }
 
     fn sgc(&self, args: &[&str]) -> Command {
@@ -69,11 +70,7 @@ impl Place {
     /// The same with the desk's clock.
     fn by_clock(&self, args: &[&str]) -> Command {
         let mut command = self.sgc(args);
-        if self.has_clock {
-            command.env("LD_PRELOAD", faketime()).env("FAKETIME_TIMESTAMP_FILE", self.file("clock"));
-            // It looks at the file once a second.
-            command.env("FAKETIME_CACHE_DURATION", "1").env("FAKETIME_DONT_FAKE_MONOTONIC", "1");
-        }
+        command.envs(self.clock.iter().flat_map(FakeClock::environment));
         command
     }
 
@@ -188,13 +185,6 @@ impl Drop for Place {
     }
 }
 
-/// Returns the library of Debian's package `libfaketime`.
-fn faketime() -> PathBuf {
-    let places = fs::read_dir("/usr/lib").unwrap().flatten();
-    let mut found = places.map(|place| place.path().join("faketime/libfaketimeMT.so.1"));
-    found.find(|library| library.exists()).expect("libfaketime is missing: run `make deps-test`")
-}
-
 #[test]
 fn node_with_a_clock_days_behind_or_ahead_waits_and_goes_on_once_it_is_set() {
     let mut place = Place::new("clock");
@@ -243,7 +233,7 @@ fn node_whose_certificate_has_ended_starts_and_goes_on_once_it_is_renewed() {
     let mut place = Place::new("renewed");
     place.set_clock("-100d");
     place.enroll();
-    place.has_clock = false;
+    place.clock = None;
     let good = |args: &[&str]| {
         let output = place.sgc(args).output().unwrap();
         assert!(output.status.success(), "{args:?}: {output:?}");

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use sgc_node::DataDrop;
-use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Qos, Use, UseRoute};
+use sgc_node::graph::{DeadMan, Endpoint, Graph, Interface, NameLine, Qos, Use, UseRoute};
 use sgc_ros::{Naming, Rename, is_pattern};
 
 use crate::finding::{Direction, Finding, Hop, LinkFinding, LocalFinding, QosMismatch, TrafficFinding};
@@ -196,6 +196,19 @@ pub(super) fn traffic(line: &NameLine, direction: Direction, steps: &mut Walk) {
     let (worst, total) = (worst.clone(), counts.values().sum::<u64>());
     let found = Finding::Traffic(TrafficFinding::Dropped { counts, worst });
     steps.push(if total > line.packets { Step::wrong(found) } else { Step::unknown(found) });
+}
+
+/// Describes the dead-man switch of a topic.
+pub(super) fn dead_man(switch: &DeadMan, topic: &str) -> Step {
+    let (dead_man, topic) = (switch.clone(), topic.to_owned());
+    // If nothing that came was held back, silence is no fault.
+    let held_back = dead_man.late + dead_man.unjudged + dead_man.not_resumed;
+    let is_idle = held_back == 0 && dead_man.no_stop_message.is_none();
+    match &dead_man.stopped {
+        None => Step::fine(Finding::Local(LocalFinding::CommandsPass { stops: dead_man.stops })),
+        Some(_) if is_idle => Step::fine(Finding::Local(LocalFinding::Stopped { dead_man, topic })),
+        Some(_) => Step::wrong(Finding::Local(LocalFinding::Stopped { dead_man, topic })),
+    }
 }
 
 /// Returns the step that sends the user to the other side.

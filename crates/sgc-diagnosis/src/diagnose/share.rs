@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use sgc_node::graph::{Graph, Interface, Share, ShareRoute};
 
 use super::local::{
-    Written, ends, far_half, line_of, linked, no_provider, problem_of, readers, silent, traffic, types_of,
-    unasserted,
+    Written, dead_man, ends, far_half, line_of, linked, no_provider, problem_of, readers, silent, traffic,
+    types_of, unasserted,
 };
 use crate::finding::{Direction, Finding, Hop, LocalFinding, ShareFinding};
 use crate::step::{Step, Verdict, Walk};
@@ -170,6 +170,12 @@ fn walk_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: bool, 
     traffic(&line, Direction::Shared, steps);
     if steps.iter().any(|step| step.verdict == Verdict::Wrong) {
         return;
+    }
+    if let Some(switch) = &route.dead_man {
+        steps.push(dead_man(switch, topic));
+        if steps.iter().any(|step| step.verdict == Verdict::Wrong) {
+            return;
+        }
     }
     if route.is_written {
         let written =

@@ -5,8 +5,8 @@ use sgc_node::graph::{Graph, Interface, JoinState, NameLine, Use, UseRoute};
 use sgc_ros::is_for_wildcards;
 
 use super::local::{
-    Written, ends, far_half, line_of, linked, meant, name_at_owner, no_provider, problem_of, readers, silent,
-    traffic, types_of, unasserted,
+    Written, dead_man, ends, far_half, line_of, linked, meant, name_at_owner, no_provider, problem_of,
+    readers, silent, traffic, types_of, unasserted,
 };
 use crate::finding::{Direction, Finding, Hop, LocalFinding, Reach, UseFinding};
 use crate::step::{Step, Walk};
@@ -181,20 +181,14 @@ fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
     steps.push(if route.messages == 0 {
         Step::unknown(Finding::Use(UseFinding::NoMessage { owner: owner(), topic: far_topic() }))
     } else {
-        fine(UseFinding::Received { messages: route.messages, last_s: route.last_s })
+        fine(UseFinding::Received {
+            messages: route.messages,
+            last_s: route.last_s,
+            age: route.age_us.zip(route.age_error_us),
+        })
     });
     traffic(&line, Direction::In, steps);
-    if let Some(dead_man) = &route.dead_man {
-        let (dead_man, topic) = (dead_man.clone(), topic.to_owned());
-        // Nothing that came was held back, so silence is no fault.
-        let held_back = dead_man.late + dead_man.unjudged + dead_man.not_resumed;
-        let is_idle = held_back == 0 && dead_man.no_stop_message.is_none();
-        steps.push(match &dead_man.stopped {
-            None => fine(UseFinding::CommandsPass { stops: dead_man.stops }),
-            Some(_) if is_idle => fine(UseFinding::Stopped { dead_man, topic }),
-            Some(_) => wrong(UseFinding::Stopped { dead_man, topic }),
-        });
-    }
+    steps.extend(route.dead_man.as_ref().map(|switch| dead_man(switch, topic)));
 }
 
 /// Returns whether the path to an owner over a link is direct, and why not. An earlier version does not tell the reason.

@@ -363,6 +363,8 @@ pub struct ShareRoute {
     pub written: u64,
     /// Number of local readers that get far messages.
     pub matched: u32,
+    /// Dead-man switch of far messages, if there is one.
+    pub dead_man: Option<DeadMan>,
     /// Whether messages published here travel as JSON.
     pub is_json: bool,
     /// Whether messages travel as JSON although their type is unknown here.
@@ -470,6 +472,10 @@ pub struct UseRoute {
     pub messages: u64,
     /// Time in seconds since the last message was written to the local network.
     pub last_s: Option<u64>,
+    /// Time from the publication of the last message to its arrival, microseconds.
+    pub age_us: Option<i64>,
+    /// Greatest error of that; null while the owner's clock is not known, so that the clocks of both hosts count as equal.
+    pub age_error_us: Option<i64>,
     /// Dead-man switch, if it has one.
     pub dead_man: Option<DeadMan>,
     /// Whether messages travel as JSON although their type is unknown here.

@@ -194,9 +194,12 @@ pub struct ReportTopic {
     pub waiting: bool,
     /// The number of messages that were published or delivered.
     pub messages: u64,
-    /// The time from the publication of the last message until it arrived here, microseconds, by the clocks of both
-    /// hosts; null if the topic is the node's own, or nothing came.
+    /// The time from the publication of the last message until it arrived here, microseconds; null if the topic is the
+    /// node's own, or nothing came.
     pub age_us: Option<i64>,
+    /// The greatest error of that, microseconds; null while the owner's clock is not known, so that the clocks of both
+    /// hosts count as equal.
+    pub age_error_us: Option<i64>,
     /// The node id of the next node on the path to the owner; null if the topic is the node's own, or there is no path.
     pub via: Option<String>,
     /// `true` if that is the owner itself.

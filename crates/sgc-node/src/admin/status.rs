@@ -34,6 +34,8 @@ pub struct Status {
     pub routers: Vec<RouterStatus>,
     /// The peers with which data is exchanged over routers, at most 256.
     pub not_direct: Vec<NotDirect>,
+    /// The clocks of the nodes that messages come from, at most 256.
+    pub clocks: Vec<ClockLine>,
     /// The port that the gateway maps for direct links.
     pub port_mapping: PortMappingStatus,
     /// The address of this host from which packets to the IPv6 internet leave; null without a route there.
@@ -85,6 +87,23 @@ impl NotDirect {
         let NotDirectPeer { peer, name, reason } = peer;
         Self { peer, name, reason, why: reason.to_string(), fix: reason.fix() }
     }
+}
+
+/// The clock of a node that messages come from.
+#[derive(Clone, Debug, Serialize)]
+pub struct ClockLine {
+    /// The node id of the peer.
+    pub peer: String,
+    /// The name of the peer, or the beginning of its node id if this node does not know the name.
+    pub name: String,
+    /// The time by which its clock is ahead of this node's, microseconds; less than 0 if it is behind.
+    pub ahead_us: i64,
+    /// The greatest error of that, microseconds.
+    pub error_us: i64,
+    /// Seconds since it last told its time.
+    pub measured_s: u64,
+    /// The number of times that the clock was set since this node asks for it.
+    pub steps: u32,
 }
 
 /// The port that the gateway maps for direct links.
@@ -209,6 +228,13 @@ pub struct RouteLine {
     /// The number of signatures for messages of the present publishers. Under load it is smaller than `messages`,
     /// because one signature covers a batch. 0 in the `group` suites.
     pub signatures: u64,
+    /// The time from the publication of the last message to its arrival, microseconds, of a topic that comes here.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub age_us: Option<i64>,
+    /// The greatest error of that, microseconds; missing while the owner's clock is not known, so that the clocks of both
+    /// hosts count as equal.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub age_error_us: Option<i64>,
     /// Bytes of payload before and after compression, of a topic that this node compresses.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub compressed: Option<(u64, u64)>,
@@ -224,6 +250,8 @@ impl RouteLine {
     ) -> Self {
         Self {
             compressed,
+            age_us: None,
+            age_error_us: None,
             state: route_state(&route) + &calls.unwrap_or_default(),
             direction: route.kind.key(),
             topic: route.topic,

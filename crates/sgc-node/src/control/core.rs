@@ -4,6 +4,7 @@
 //! in other tasks and threads.
 
 mod alerts;
+mod clocks;
 mod consumers;
 mod direct;
 mod graph;
@@ -26,7 +27,7 @@ use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
 use sgc_ros::{RosNetwork, Routes, ShareRule, UseRule};
 use sgc_router::{Output as RouterOutput, Router, StoreOp};
-use sgc_session::KeepAlivePolicy;
+use sgc_session::{KeepAlivePolicy, PeerClocks};
 use sgc_sync::Workers;
 use sgc_transport::{AnyLink, CredentialStore};
 use sgc_trust::{Grantees, Identity, TrustAnchors};
@@ -54,6 +55,7 @@ use crate::control::parts::direct_links::{DirectEnds, DirectLinks};
 use crate::control::parts::forward_table::ForwardTable;
 use crate::control::parts::link_table::LinkTable;
 use crate::control::parts::network_ends::{NetworkEnds, OpenEnd};
+use crate::control::parts::newcomers::Newcomers;
 use crate::control::parts::publishers::Publishers;
 use crate::control::parts::services::Services;
 use crate::control::parts::shares::Shares;
@@ -100,9 +102,11 @@ pub(crate) struct Core<N: RosNetwork> {
     inbox: Inbox,
     links: LinkTable,
     direct: DirectLinks,
+    /// The clocks of the nodes that messages come from.
+    clocks: PeerClocks,
     /// The task of the store of names.
     store: Option<mpsc::Sender<StoreOp>>,
-    /// A grant came since the last look at the peers of direct links.
+    /// A grant came since the last look at the peers that data is exchanged with.
     is_newly_granted: bool,
     forwards: ForwardTable,
     shares: Shares,
@@ -119,6 +123,8 @@ pub(crate) struct Core<N: RosNetwork> {
     /// Local consumers that owners are told, and far consumers that are shown here.
     consumers: FarConsumers,
     publishers: Publishers,
+    /// Local publishers that were there before this node.
+    newcomers: Newcomers,
     /// Set if this node is the authority of its fleet.
     authority: Option<Authority>,
     /// Operations that users of this node request.
@@ -250,6 +256,7 @@ impl<N: RosNetwork> Core<N> {
             inbox: Inbox::default(),
             links: LinkTable::new(parts.keep_alive_policy, parts.names.clone(), data.clone()),
             direct: DirectLinks::new(own, parts.direct, Grantees::default(), parts.rng),
+            clocks: PeerClocks::new(Instant::now()),
             store: parts.store,
             is_newly_granted: false,
             forwards: ForwardTable::default(),
@@ -263,6 +270,7 @@ impl<N: RosNetwork> Core<N> {
             reopening: NetworkState::default(),
             consumers: FarConsumers::default(),
             publishers: Publishers::new(parts.message_keys),
+            newcomers: Newcomers::new(Instant::now()),
             authority: parts.authority,
             operations: Operations::default(),
             gateway: parts.gateway,
@@ -291,6 +299,9 @@ impl<N: RosNetwork> Core<N> {
         };
         core.set_observers(parts.observers);
         core.set_direct(parts.direct_peers, parts.port_mapping);
+        if core.routes.is_some() {
+            core.endpoint.offer_clock(now());
+        }
         (core, requested)
     }
 
@@ -523,7 +534,7 @@ impl<N: RosNetwork> Core<N> {
                     output => self.router_output(output),
                 }
             };
-            let mut progressed = self.drain_direct();
+            let mut progressed = self.drain_direct() | self.drain_clocks();
             let endpoint = loop {
                 match self.endpoint.poll_output() {
                     EndpointOutput::Timeout(at) => break at,
@@ -549,6 +560,7 @@ impl<N: RosNetwork> Core<N> {
                     self.inquiries.deadline(),
                     self.reports.deadline(),
                     self.direct.deadline(),
+                    self.clocks.deadline(),
                 ];
                 let own = own.into_iter().chain([self.reopening.deadline()]);
                 let all = [router, endpoint, routes, self.sinks.deadline(), rekey, self.services.deadline()];

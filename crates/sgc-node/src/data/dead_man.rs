@@ -19,8 +19,10 @@ use crate::data::stats::DataDrop;
 
 /// Longest command that is compared with the stop message, in bytes.
 const STOP_BYTES_MAX: usize = 4096;
-/// Time after which a stop message that could not be published is tried again.
-const STOP_AGAIN: Duration = Duration::from_secs(1);
+/// Time after which a stop message that could not be published, or that nobody would have heard, is tried again.
+const STOP_AGAIN: Duration = Duration::from_millis(200);
+/// Interval of looking for local readers that have not heard the stop message.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
 
 /// The dead-man switch of a topic that comes here.
 pub(crate) struct DeadManSwitch {
@@ -39,6 +41,8 @@ struct State {
     made: Option<Message>,
     /// Why no stop message can be made.
     failure: Option<String>,
+    /// The local readers that there were at the last stop message.
+    readers: u32,
 }
 
 /// The work of a dead-man switch since it was set.
@@ -48,32 +52,6 @@ struct DeadManCounts {
     late: u64,
     unjudged: u64,
     not_resumed: u64,
-}
-
-/// The state of a dead-man switch.
-#[derive(Clone, Debug)]
-pub(crate) struct DeadManView {
-    stopped: Option<(StopCause, Instant)>,
-    failure: Option<String>,
-    resume: Resume,
-    counts: DeadManCounts,
-}
-
-impl DeadManView {
-    /// Returns the state as the status socket shows it.
-    pub(crate) fn shown(&self) -> graph::DeadMan {
-        let DeadManCounts { stops, late, unjudged, not_resumed } = self.counts;
-        graph::DeadMan {
-            stopped: self.stopped.map(|(cause, _)| cause_word(cause).to_owned()),
-            stopped_s: self.stopped.map_or(0, |(_, since)| since.elapsed().as_secs()),
-            no_stop_message: self.failure.clone(),
-            is_manual: self.resume == Resume::Manual,
-            stops,
-            late,
-            unjudged,
-            not_resumed,
-        }
-    }
 }
 
 /// Why no dead-man switch was told to resume.
@@ -97,6 +75,7 @@ impl DeadManSwitch {
             counts: DeadManCounts::default(),
             made: None,
             failure: None,
+            readers: 0,
         };
         Self { state: state.into(), changed: Arc::default() }
     }
@@ -119,26 +98,39 @@ impl DeadManSwitch {
 
     /// Returns when [`Self::tick`] has something to do.
     pub(crate) fn due(&self) -> Option<Instant> {
-        self.lock().switch.due()
+        let state = self.lock();
+        let look = state.switch.stopped().map(|_| Instant::now() + LOOK_EVERY);
+        state.switch.due().into_iter().chain(look).min()
     }
 
-    /// Returns the state.
-    pub(crate) fn view(&self) -> DeadManView {
+    /// Returns the state as the status socket shows it.
+    pub(crate) fn view(&self) -> graph::DeadMan {
         let state = self.lock();
-        let failure = state.failure.clone();
-        DeadManView {
-            stopped: state.switch.stopped(),
-            failure,
-            resume: state.rule.resume,
-            counts: state.counts,
+        let stopped = state.switch.stopped();
+        let DeadManCounts { stops, late, unjudged, not_resumed } = state.counts;
+        graph::DeadMan {
+            stopped: stopped.map(|(cause, _)| cause_word(cause).to_owned()),
+            stopped_s: stopped.map_or(0, |(_, since)| since.elapsed().as_secs()),
+            no_stop_message: state.failure.clone(),
+            is_manual: state.rule.resume == Resume::Manual,
+            stops,
+            late,
+            unjudged,
+            not_resumed,
         }
     }
 
-    /// Judges a message on its way to the local network.
+    /// Judges a message on its way to the local network. `least_age` is its age in ns at least, if that is known.
     ///
     /// # Errors
     /// It is a command that must not reach the robot.
-    pub(crate) fn judge(&self, now: Instant, message: &Message, types: &TypeSlot) -> Result<(), DataDrop> {
+    pub(crate) fn judge(
+        &self,
+        now: Instant,
+        message: &Message,
+        least_age: Option<i64>,
+        types: &TypeSlot,
+    ) -> Result<(), DataDrop> {
         // The end of an instance moves nothing.
         if message.head.kind != MessageKind::Write {
             return Ok(());
@@ -147,7 +139,7 @@ impl DeadManSwitch {
         let before = state.switch.stopped();
         let (source, seq, stamp_ns) = (message.source, message.seq, message.head.source_timestamp_ns);
         let is_stop = before.is_some() && state.is_stop(message, types);
-        let judged = state.switch.judge(now, Command { source, seq, stamp_ns, is_stop });
+        let judged = state.switch.judge(now, Command { source, seq, stamp_ns, least_age, is_stop });
         if state.tell_stop(before.is_none()) {
             self.changed.notify_one();
         }
@@ -173,9 +165,16 @@ impl DeadManSwitch {
         }
     }
 
-    /// Returns whether the stop message is to be published now.
-    pub(crate) fn tick(&self, now: Instant) -> bool {
-        self.lock().tell(|switch| switch.tick(now))
+    /// Returns whether the stop message is to be published now, to so many local readers: it is due, or one of them is new
+    /// to the stopped robot.
+    pub(crate) fn tick(&self, now: Instant, readers: u32) -> bool {
+        let state = &mut *self.lock();
+        let is_due = state.tell(|switch| switch.tick(now));
+        let is_stopped = state.switch.stopped().is_some();
+        let has_new = is_stopped && readers > state.readers;
+        // One that is gone may come back.
+        state.readers = state.readers.min(readers);
+        is_due || has_new
     }
 
     /// Returns whether the stop message is to be published because the last local writer closes.
@@ -199,14 +198,16 @@ impl DeadManSwitch {
         self.lock().last.as_ref().map(|last| last.source)
     }
 
-    /// Notes that the stop message was published, or that it has to be tried again.
-    pub(crate) fn note_published(&self, is_published: bool) {
+    /// Notes that so many local readers got what there is of a stop message.
+    pub(crate) fn note_published(&self, readers: u32, is_message: bool) {
         let mut state = self.lock();
-        if is_published {
-            state.counts.stops += 1;
-        } else {
-            state.switch.not_published(Instant::now() + STOP_AGAIN);
-        }
+        state.counts.stops += u64::from(is_message);
+        state.readers = readers;
+    }
+
+    /// Notes that the stop message has to be tried again.
+    pub(crate) fn note_not_published(&self) {
+        self.lock().switch.not_published(Instant::now() + STOP_AGAIN);
     }
 
     /// Makes the stop message, or returns the last one that could be made. Returns `None` if there is none: no command

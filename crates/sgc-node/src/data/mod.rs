@@ -17,6 +17,7 @@ pub(crate) mod pending;
 pub(crate) mod queue;
 pub(crate) mod sending;
 pub(crate) mod sinks;
+pub(crate) mod source_clocks;
 pub(crate) mod spacing;
 pub(crate) mod stats;
 pub(crate) mod tap;

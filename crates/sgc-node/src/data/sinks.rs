@@ -18,10 +18,12 @@ use tokio::sync::{OwnedMutexGuard, mpsc};
 use tokio::time::timeout_at;
 use tracing::{debug, warn};
 
+use crate::admin::graph;
 use crate::clock::unix_ns;
 use crate::data::conversion::{KnownType, TypeSlot};
-use crate::data::dead_man::{DeadManSwitch, DeadManView};
+use crate::data::dead_man::DeadManSwitch;
 use crate::data::pending::{PendingBytes, PendingQueue};
+use crate::data::source_clocks::SourceClocks;
 use crate::data::stats::{CountDrops, DataDrop, Dropped, Drops};
 use crate::data::tap::{TapMessage, Taps};
 use crate::data::writer_queue::{FramePrefix, WRITER_MESSAGES_MAX, WriteOutcome, WriterQueue};
@@ -34,6 +36,15 @@ const LAST_WRITES_MAX: Duration = Duration::from_secs(1);
 const ASK_WRITER_EVERY: Duration = Duration::from_secs(1);
 /// Age of the last message before there is one.
 const NO_AGE: i64 = i64::MIN;
+
+/// Time from the publication of a message to its arrival.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct MessageAge {
+    /// Microseconds; less than 0 if clocks differ in a way that is not known.
+    pub(crate) age_us: i64,
+    /// The greatest error of that by the clock of the owner's node; `None` while it is not known: then clocks count as equal.
+    pub(crate) error_us: Option<i64>,
+}
 
 /// Request of a sink to the control task.
 #[derive(Clone, Copy, Debug)]
@@ -82,6 +93,7 @@ pub(crate) struct LocalSink {
     taps: Taps,
     frames: FramePrefix,
     dead_man: ArcSwapOption<DeadManSwitch>,
+    clocks: SourceClocks,
     types: Arc<TypeSlot>,
     /// Whether messages arrive as JSON.
     takes_json: AtomicBool,
@@ -114,6 +126,7 @@ impl LocalSink {
             taps: Taps::default(),
             frames: FramePrefix::default(),
             dead_man: ArcSwapOption::empty(),
+            clocks: SourceClocks::default(),
             types: Arc::default(),
             takes_json: AtomicBool::new(false),
             asks_for_writer: AtomicBool::new(false),
@@ -155,16 +168,21 @@ impl LocalSink {
         last.map(|last| last.elapsed())
     }
 
-    /// Returns the time from the publication of the last message to its arrival, nanoseconds by the clocks of both
-    /// hosts: less than 0 if the publisher's is ahead.
-    pub(crate) fn last_age_ns(&self) -> Option<i64> {
-        Some(self.age_ns.load(Relaxed)).filter(|age| *age != NO_AGE)
+    /// Returns the time from the publication of the last message to its arrival.
+    pub(crate) fn last_age(&self) -> Option<MessageAge> {
+        let age_ns = Some(self.age_ns.load(Relaxed)).filter(|age| *age != NO_AGE)?;
+        let known = self.clocks.owner().map(|bounds| bounds.offset(Instant::now(), unix_ns()));
+        Some(match known {
+            Some((ahead_ns, error_ns)) => {
+                MessageAge { age_us: age_ns.saturating_add(ahead_ns) / 1000, error_us: Some(error_ns / 1000) }
+            }
+            None => MessageAge { age_us: age_ns / 1000, error_us: None },
+        })
     }
 
-    /// Notes that a message was handed to its writer.
-    fn note_delivered(&self, head: &MessageHead) {
-        self.delivered.fetch_add(1, Relaxed);
-        if head.source_timestamp_ns > 0 {
+    /// Notes how old a message is by the clocks of both hosts.
+    fn note_age(&self, head: &MessageHead) {
+        if head.kind == MessageKind::Write && head.source_timestamp_ns > 0 {
             self.age_ns.store(unix_ns().saturating_sub(head.source_timestamp_ns), Relaxed);
         }
     }
@@ -376,6 +394,11 @@ impl LocalSink {
         *lock(&self.shaping)
     }
 
+    /// Returns the clocks of those that publish to it.
+    pub(crate) fn clocks(&self) -> &SourceClocks {
+        &self.clocks
+    }
+
     /// Sets the prefix of frame names in tf messages.
     pub(crate) fn set_frames(&self, prefix: Option<String>) {
         self.frames.store(prefix.map(Arc::new));
@@ -458,7 +481,7 @@ impl LocalSink {
     }
 
     /// Returns the state of the dead-man switch.
-    pub(crate) fn dead_man(&self) -> Option<DeadManView> {
+    pub(crate) fn dead_man(&self) -> Option<graph::DeadMan> {
         self.dead_man.load().as_ref().map(|switch| switch.view())
     }
 
@@ -472,7 +495,7 @@ impl LocalSink {
     fn tick_dead_man(&self) {
         let Some(switch) = self.dead_man.load_full() else { return };
         let _state = self.lock();
-        if switch.tick(Instant::now()) {
+        if switch.tick(Instant::now(), self.matched()) {
             self.publish_stop(&switch);
         }
     }
@@ -491,14 +514,21 @@ impl LocalSink {
         let writers = self.writers.load();
         let last = switch.last_source().and_then(|source| writers.get(&Some(source)));
         let Some(writer) = last.or_else(|| writers.values().next()) else {
-            return switch.note_published(false);
+            return switch.note_not_published();
         };
-        let Ok(message) = switch.stop_message(&self.types) else { return switch.note_published(false) };
-        let Some(message) = message else { return };
+        // Nobody would hear it. A reader on its way would not learn that the robot is to stop.
+        let readers = self.matched();
+        if readers == 0 {
+            return switch.note_not_published();
+        }
+        let Ok(message) = switch.stop_message(&self.types) else { return switch.note_not_published() };
+        let Some(message) = message else { return switch.note_published(readers, false) };
         self.taps.offer(|| self.tapped(&message));
         // It makes room for itself, so that it is never returned.
-        let is_taken = matches!(writer.try_push(message, true), WriteOutcome::Taken { .. });
-        switch.note_published(is_taken);
+        match writer.try_push(message, true) {
+            WriteOutcome::Taken { .. } => switch.note_published(readers, true),
+            WriteOutcome::Full(_) => switch.note_not_published(),
+        }
     }
 
     /// Returns the state of the type.
@@ -610,7 +640,7 @@ impl LocalSink {
             Handover::Full(message) => message,
         };
         let Some(writer) = self.writer(&message.source) else { return Err(Dropped::one(DataDrop::NoWriter)) };
-        self.note_delivered(&message.head);
+        self.delivered.fetch_add(1, Relaxed);
         self.taps.offer(|| self.tapped(&message));
         writer.push(message).await.map_err(|_| Dropped::one(DataDrop::Stalled))
     }
@@ -645,14 +675,23 @@ impl LocalSink {
         if waits {
             return self.hold(message, held, DataDrop::NoDefinition).into();
         }
+        self.note_age(&head);
         if writer.has_written(&head) {
             return Handover::dropped(DataDrop::Repeated);
         }
+        if writer.limits_age() && head.kind == MessageKind::Write {
+            let least_age = self.least_age(Instant::now(), &message);
+            if writer.is_too_old(unix_ns(), &head, least_age) {
+                return Handover::dropped(DataDrop::TooOld);
+            }
+        }
         let switch = self.dead_man.load();
-        if let Some(switch) = &*switch
-            && let Err(reason) = switch.judge(Instant::now(), &message, &self.types)
-        {
-            return Handover::dropped(reason);
+        if let Some(switch) = &*switch {
+            let now = Instant::now();
+            let least_age = self.least_age(now, &message);
+            if let Err(reason) = switch.judge(now, &message, least_age, &self.types) {
+                return Handover::dropped(reason);
+            }
         }
         let tapped = self.taps.is_any().then(|| self.tapped(&message));
         // Converting takes time, and may have to wait for the type.
@@ -662,7 +701,7 @@ impl LocalSink {
             WriteOutcome::Full(_) if switch.is_some() => return Handover::dropped(DataDrop::Stalled),
             WriteOutcome::Full(message) => return Handover::Full(message),
         };
-        self.note_delivered(&head);
+        self.delivered.fetch_add(1, Relaxed);
         if let Some(tapped) = tapped {
             self.taps.offer(|| tapped);
         }
@@ -676,6 +715,14 @@ impl LocalSink {
         let late = held.queue.give_up_late(now, |message| self.is_given_up(message));
         let given_up = late + held.queue.push(now, message.payload.len(), message);
         Dropped::check(lost, given_up)
+    }
+
+    /// Returns the least age of a message by its publisher's clock, in ns, if that is known.
+    fn least_age(&self, now: Instant, message: &Message) -> Option<i64> {
+        let Message { source, head, .. } = message;
+        // The owner's own sources have writers of their own.
+        let is_owner = self.writers.load().contains_key(&Some(*source));
+        self.clocks.least_age(now, source, is_owner, head.source_timestamp_ns)
     }
 
     fn tapped(&self, message: &Message) -> TapMessage {
@@ -944,7 +991,7 @@ mod tests {
         sink.set_type(any_type(), &data);
         wait_until(|| payloads.lock().unwrap().len() == 1).await;
         assert_eq!(payloads.lock().unwrap()[0][..], *b"\0\x01\0\0\x05\0\0\0stop\0");
-        let view = sink.dead_man().unwrap().shown();
+        let view = sink.dead_man().unwrap();
         assert_eq!((view.stopped.as_deref(), view.stops), (Some("start"), 1));
         // A stop message that is none of the type does not replace it.
         let wrong = StopMessage::Json("{\"c\": 1}".into());
@@ -979,7 +1026,7 @@ mod tests {
         sink.set_writer(None, None, &data);
         wait_until(|| payloads.lock().unwrap().len() == 4).await;
         assert_eq!(payloads.lock().unwrap()[2..], [&b"on"[..]; 2]);
-        assert_eq!(sink.dead_man().unwrap().shown().stopped.as_deref(), Some("closed"));
+        assert_eq!(sink.dead_man().unwrap().stopped.as_deref(), Some("closed"));
         sink.close();
     }
 

@@ -626,6 +626,22 @@ impl WriterQueue {
         self.shaper().set(shaping);
     }
 
+    /// Returns `true` if there is a limit of age.
+    pub(crate) fn limits_age(&self) -> bool {
+        !self.is_unshaped.load(Relaxed) && self.shaper().shaping().max_age.is_some()
+    }
+
+    /// Returns `true` if a message is too old by its least age in ns, or while that is not known by the clock of this node,
+    /// where the fastest message of the publisher counts as new.
+    pub(crate) fn is_too_old(&self, now_ns: i64, head: &MessageHead, least_age: Option<i64>) -> bool {
+        let mut shaper = self.shaper();
+        match (least_age, shaper.shaping().max_age) {
+            (_, None) => false,
+            (Some(age), Some(max)) => Duration::from_nanos(age.max(0).unsigned_abs()) > max,
+            (None, Some(_)) => shaper.is_too_old(now_ns, head.source_timestamp_ns),
+        }
+    }
+
     /// Takes the next message if it is due, or the newest one if later messages replace it.
     fn next(&self, held: &mut Option<Held>) -> Step {
         let of_queue = || Some(Held { message: self.queue.try_pop()?, gave_way: false });
@@ -810,7 +826,8 @@ pub(crate) mod tests {
     }
 
     pub(crate) fn taking(take: impl FnMut(Message, NextMessage) + Send + 'static) -> Arc<WriterQueue> {
-        let info = WriterInfo { is_free: Box::new(|_| true), ..WriterInfo::default() };
+        let (is_free, matched) = (Box::new(|_: &_| true), Box::new(|| 1));
+        let info = WriterInfo { is_free, matched, ..WriterInfo::default() };
         WriterQueue::new(context(), info, Shaping::default(), take)
     }
 

@@ -196,6 +196,7 @@ pub fn nodes(names: &[&str]) -> Vec<Recipient> {
 
 pub fn share(topic: &str, to: &[&str]) -> ShareConfig {
     ShareConfig {
+        dead_man: None,
         interface: Default::default(),
         topic: topic.into(),
         naming: Default::default(),

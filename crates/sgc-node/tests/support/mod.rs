@@ -310,6 +310,7 @@ impl Trio {
 /// Returns a share of a topic with the desk.
 pub fn shared_topic(topic: &str) -> ShareConfig {
     ShareConfig {
+        dead_man: None,
         interface: Default::default(),
         topic: topic.into(),
         naming: Default::default(),

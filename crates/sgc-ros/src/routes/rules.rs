@@ -29,6 +29,8 @@ pub struct ShareRule {
     pub suite: Suite,
     /// The class of the packets.
     pub class: Class,
+    /// The dead-man switch of what others publish.
+    pub dead_man: Option<DeadManRule>,
     /// The limits of the traffic.
     pub shaping: Shaping,
     /// Policies that replace those of the publishers.

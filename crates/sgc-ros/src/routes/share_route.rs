@@ -366,7 +366,7 @@ impl ShareRoute {
 
     /// Opens, replaces or closes the local writer for messages of others. A new writer takes the place of the old one,
     /// so no message is without a writer meanwhile.
-    fn refresh_writer(&mut self, rule: &ShareRule) -> Option<Command> {
+    pub(super) fn refresh_writer(&mut self, rule: &ShareRule) -> Option<Command> {
         let wanted = self.wanted_writer(rule);
         if self.writer == wanted {
             return None;
@@ -380,13 +380,15 @@ impl ShareRoute {
     }
 
     /// Returns the writer for messages of others: with ROS 2's default QoS, and the deadline, lifespan and liveliness
-    /// that they announced. There is none while all of them are known to be gone, if subscribers may watch for that.
+    /// that they announced. There is none while all of them are known to be gone, if subscribers may watch for that, except
+    /// for the stop message of a dead-man switch.
     fn wanted_writer(&self, rule: &ShareRule) -> Option<EndpointSpec> {
-        if rule.is_service() || !self.has_publishers || self.announced.are_gone() {
+        let are_gone = !self.has_publishers || self.announced.are_gone();
+        if rule.is_service() || (are_gone && rule.dead_man.is_none()) {
             return None;
         }
         let mut qos = Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() };
-        if let Some(offer) = &self.announced.offer {
+        if let Some(offer) = self.announced.offer.as_ref().filter(|_| !are_gone) {
             qos.deadline_ns = offer.deadline_ns;
             qos.lifespan_ns = offer.lifespan_ns;
             qos.liveliness = offer.liveliness;

@@ -5,6 +5,7 @@
 //! the test uses as it likes.
 
 mod certificates;
+mod clocks;
 mod consumers;
 mod floods;
 mod identity_in_use;

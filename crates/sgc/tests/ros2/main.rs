@@ -10,6 +10,7 @@
 mod all;
 mod bugs;
 mod calls;
+mod clocks;
 mod dead_man;
 mod durable;
 mod events;

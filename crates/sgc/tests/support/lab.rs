@@ -92,15 +92,21 @@ impl Lab {
 
     /// The same for real ROS 2: the nodes discover as ROS does by default.
     pub(crate) fn real(plan: Plan, tables: [String; 2]) -> Self {
-        let mut lab = Self::silent(plan, tables);
-        for site in [Site::Robot, Site::Desk] {
-            lab.reconfigure(site, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
-        }
+        let mut lab = Self::silent_real(plan, tables);
         lab.start_all();
         lab
     }
 
     /// The same before the nodes are started.
+    pub(crate) fn silent_real(plan: Plan, tables: [String; 2]) -> Self {
+        let lab = Self::silent(plan, tables);
+        for site in [Site::Robot, Site::Desk] {
+            lab.reconfigure(site, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
+        }
+        lab
+    }
+
+    /// A fleet with the configurations of its nodes, before they are started.
     pub(crate) fn silent(plan: Plan, [robot, desk]: [String; 2]) -> Self {
         let number = LABS.fetch_add(1, Ordering::Relaxed);
         let made = make_namespaces(&format!("{}-{}-{number}", plan.name, std::process::id()));

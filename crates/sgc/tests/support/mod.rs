@@ -3,6 +3,7 @@
 
 #![allow(dead_code, reason = "each test program uses a part")]
 
+pub(crate) mod fake_clock;
 pub(crate) mod turn;
 
 use std::fs;

@@ -115,6 +115,7 @@ impl<N: RosNetwork> Core<N> {
         let mut progressed = false;
         if std::mem::take(&mut self.is_newly_granted) {
             self.look_at_direct(Instant::now());
+            self.look_at_clocks(Instant::now());
         }
         while let Some(output) = self.direct.poll() {
             progressed = true;

@@ -147,6 +147,7 @@ impl<N: RosNetwork> Core<N> {
                 messages: self.shares.get(&route.name).map_or(0, |share| share.published()),
                 written: sink.map_or(0, |sink| sink.delivered()),
                 matched: sink.map_or(0, |sink| sink.matched()),
+                dead_man: sink.and_then(|sink| sink.dead_man()),
                 is_json: route.form == PayloadForm::Json,
                 lacks_definition: self.lacks_definition(&route.name, route.form),
             });
@@ -191,6 +192,7 @@ impl<N: RosNetwork> Core<N> {
             names.insert(route.name);
             let published = self.shares.get(&route.name).map(|share| share.published());
             let sink = self.sinks.get(&route.name);
+            let age = sink.and_then(|sink| sink.last_age());
             used.routes.push(UseRoute {
                 topic: route.local_name,
                 type_name: route.entry.metadata.type_name.clone(),
@@ -207,7 +209,9 @@ impl<N: RosNetwork> Core<N> {
                 lacks_definition: self.lacks_definition(&route.name, route.form),
                 messages: published.or(sink.map(|sink| sink.delivered())).unwrap_or(0),
                 last_s: sink.and_then(|sink| sink.since_last()).map(|since| since.as_secs()),
-                dead_man: sink.and_then(|sink| sink.dead_man()).map(|view| view.shown()),
+                age_us: age.map(|age| age.age_us),
+                age_error_us: age.and_then(|age| age.error_us),
+                dead_man: sink.and_then(|sink| sink.dead_man()),
             });
         }
         used
@@ -273,9 +277,12 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn resume(&self, topic: &str) -> Result<(), ResumeError> {
         let views = self.routes.iter().flat_map(|routes| routes.use_views());
         let brought = views.filter(|view| view.direction == Direction::Bring).flat_map(|view| view.routes);
-        let names = brought.filter(|route| route.local_name == topic).map(|route| route.name);
+        let brought = brought.filter(|route| route.local_name == topic).map(|route| route.name);
+        let shares = self.routes.iter().flat_map(|routes| routes.share_views()).flat_map(|view| view.routes);
+        let shared = shares.filter(|route| route.local_name == topic).map(|route| route.name);
+        let names: Vec<_> = brought.chain(shared).collect();
         let mut resumed = None;
-        for sink in names.filter_map(|name| self.sinks.get(&name)) {
+        for sink in names.iter().filter_map(|name| self.sinks.get(name)) {
             resumed = resumed.max(sink.resume_dead_man());
         }
         match resumed {

@@ -99,6 +99,7 @@ impl<N: RosNetwork> Core<N> {
             self.tell_address(link);
         }
         self.look_at_direct(at);
+        self.look_at_clocks(at);
         self.warn_of_owners_here();
         self.warn_of_misspelt(now.instant);
     }

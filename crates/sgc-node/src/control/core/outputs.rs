@@ -129,6 +129,7 @@ impl<N: RosNetwork> Core<N> {
             Event::PathAsked { sink, peer, question } => self.path_asked(sink, &peer, &question),
             Event::PathOffered { peer, offer } => self.path_offered(peer, &offer),
             Event::PathRefused { peer, by } => self.path_refused(peer, by),
+            Event::Time { peer, asked, time } => self.time_told(peer, asked, time),
             Event::OperationAnswered { name, answer } => self.operation_answered(name, answer),
             Event::OperationDenied { name, by } => self.operation_denied(name, by),
             Event::Renewed { credentials } => self.take_credentials(credentials),
@@ -170,6 +171,7 @@ impl<N: RosNetwork> Core<N> {
                     self.call_granted(now, name, sink, grant, anew);
                 } else {
                     self.sinks.grant(now.instant, name, sink, grant);
+                    self.set_clock(&name);
                 }
                 if let Some(routes) = &mut self.routes {
                     routes.handle_granted(&name, entry);
@@ -266,6 +268,7 @@ impl<N: RosNetwork> Core<N> {
             | Event::PathAsked { .. }
             | Event::PathOffered { .. }
             | Event::PathRefused { .. }
+            | Event::Time { .. }
             | Event::Rekeyed { .. }
             | Event::OwnGrant { .. }
             | Event::Recover(_)

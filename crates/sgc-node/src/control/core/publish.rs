@@ -102,6 +102,7 @@ impl<N: RosNetwork> Core<N> {
         self.apply_type(&name);
         // This node's own messages do not come back to it, since its sink receives only others'.
         self.sinks.grant(now().instant, name, SinkId([0; 16]), grant);
+        self.set_clock(&name);
         if let Some(progress) = sink.progress() {
             self.endpoint.set_own_sink(&name, progress);
         }

@@ -37,6 +37,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn network_reopened(&mut self) {
         let now = now().instant;
         self.reopening.opened(now);
+        self.newcomers.reopened(now);
         self.graph.endpoints_gone();
         let (readers, writers) = (self.ends.readers(), self.ends.writers());
         let services = self.services.ends();
@@ -77,6 +78,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn handle_discovery(&mut self, event: DiscoveryEvent) {
+        self.newcomers.note(now().instant, &event);
         if let DiscoveryEvent::Vanished { guid } = &event {
             self.services.endpoint_gone(guid);
         }

@@ -168,7 +168,7 @@ impl<N: RosNetwork> Core<N> {
             );
             let sink = route.name.and_then(|name| self.sinks.get(&name));
             let path = route.name.and_then(|name| self.path_to_owner(&name));
-            let age_us = sink.and_then(|sink| sink.last_age_ns()).map(|age_ns| age_ns / 1000);
+            let age = sink.and_then(|sink| sink.last_age());
             let forwarded = route.name.and_then(|name| self.forwards.get(&name));
             let drops = forwarded.map(|(_, stats)| stats.reasons()).unwrap_or_default();
             let line = self.route_line(route);
@@ -181,7 +181,8 @@ impl<N: RosNetwork> Core<N> {
                 stuck,
                 waiting,
                 messages: line.messages,
-                age_us,
+                age_us: age.map(|age| age.age_us),
+                age_error_us: age.and_then(|age| age.error_us),
                 direct: path.as_ref().is_some_and(|path| path.is_direct),
                 path_us: path.as_ref().map(|path| path.cost_us),
                 via: path.map(|path| path.via.to_string()),

@@ -42,7 +42,12 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             Command::DeadMan { name, rule } => {
-                if let Some(sink) = self.sinks.get(&name) {
+                let sink = match self.shares.get(&name) {
+                    // What others publish on our own share comes to a sink of ours.
+                    Some(_) => Some(self.sinks.get_or_add_own(name)),
+                    None => self.sinks.get(&name).cloned(),
+                };
+                if let Some(sink) = sink {
                     sink.set_dead_man(rule);
                 }
             }
@@ -268,7 +273,7 @@ impl<N: RosNetwork> Core<N> {
             History::KeepLast(n) => (n as usize).saturating_mul(instances).min(HISTORY_KEEP_ALL_MAX),
         };
         let receivers = self.endpoint.receivers(&name);
-        let slot = |id, qos: &Qos, sources: usize| {
+        let slot = |id, qos: &Qos, sources: usize, is_new: bool| {
             let (keeps_history, depth) = (qos.is_transient_local(), depth_of(qos));
             let config = SourceConfig {
                 name,
@@ -280,7 +285,8 @@ impl<N: RosNetwork> Core<N> {
                 recovery: RecoveryLimits { bytes_max: share_of(recovery.bytes_max, sources), ..recovery },
                 receivers: receivers.clone(),
             };
-            let source = Source::new(config, &grant, message_key.clone())?;
+            let make = if is_new { Source::new } else { Source::midway };
+            let source = make(config, &grant, message_key.clone())?;
             let manual = ManualLease::from_qos(qos, Instant::now());
             let slot = SourceSlot::new(source, keeps_history, qos.is_reliable());
             Some(SourceSlot { depth, manual, ..slot })
@@ -296,7 +302,7 @@ impl<N: RosNetwork> Core<N> {
         for (guid, id, qos) in own {
             let kept = map.slot(&id).or_else(|| old.slot(&id));
             let sources = map.own.len() + 1;
-            if let Some(mut slot) = kept.or_else(|| slot(id, &qos, sources)) {
+            if let Some(mut slot) = kept.or_else(|| slot(id, &qos, sources, self.newcomers.is_new(&guid))) {
                 let depth = depths.get(&id).copied().unwrap_or_default();
                 if slot.depth != depth {
                     share.set_history_depth(&slot, depth);
@@ -309,7 +315,7 @@ impl<N: RosNetwork> Core<N> {
         }
         if is_service {
             let mut id = || self.endpoint.new_source_id();
-            map.shared = old.shared.clone().or_else(|| slot(id(), &service_qos(), 1));
+            map.shared = old.shared.clone().or_else(|| slot(id(), &service_qos(), 1, true));
         }
         if map.own.values().any(|slot| slot.manual.is_some()) {
             map.assertions = old.assertions.clone().or_else(|| {

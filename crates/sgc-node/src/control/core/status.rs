@@ -34,6 +34,7 @@ impl<N: RosNetwork> Core<N> {
             links: links.collect(),
             routers: self.board.snapshot(),
             not_direct: self.not_direct().take(NOT_DIRECT_MAX).map(NotDirect::new).collect(),
+            clocks: self.clock_lines(),
             port_mapping: PortMappingStatus::new(self.direct.mapping(), Instant::now()),
             ipv6: source_towards(IPV6_INTERNET).map(|ip| ip.to_string()),
             routes: self.routes.iter().flat_map(Routes::status).map(|route| self.route_line(route)).collect(),
@@ -152,7 +153,13 @@ impl<N: RosNetwork> Core<N> {
         let messages = self.messages_of(&route);
         let share = route.name.and_then(|n| self.shares.get(&n));
         let compressed = share.and_then(|s| s.compressed());
-        RouteLine::new(route, calls, messages, share.map_or(0, |s| s.signatures()), compressed)
+        let age = route.name.and_then(|name| self.sinks.get(&name)?.last_age());
+        let line = RouteLine::new(route, calls, messages, share.map_or(0, |s| s.signatures()), compressed);
+        RouteLine {
+            age_us: age.map(|age| age.age_us),
+            age_error_us: age.and_then(|age| age.error_us),
+            ..line
+        }
     }
 
     /// Returns the number of messages that were published or delivered.

@@ -12,7 +12,7 @@
 //!   about calls.
 //! - [`sinks`] closes the queues of writers, which ends the writers, and drops keys of past epochs.
 //!
-//! [`forward_table`] and [`network_ends`] only keep entries.
+//! [`forward_table`], [`network_ends`] and [`newcomers`] only keep entries.
 
 pub(crate) mod certificates;
 pub(crate) mod closings;
@@ -20,6 +20,7 @@ pub(crate) mod direct_links;
 pub(crate) mod forward_table;
 pub(crate) mod link_table;
 pub(crate) mod network_ends;
+pub(crate) mod newcomers;
 pub(crate) mod publishers;
 pub(crate) mod services;
 pub(crate) mod shares;

@@ -82,7 +82,7 @@ impl Publishers {
             return if is_first { OfferStep::MakeKey(suite) } else { OfferStep::Wait };
         };
         let id = new_source_id();
-        self.offered.insert(name, OfferedSource::new(id, offer.class, offer.reliable));
+        self.offered.insert(name, OfferedSource::new(id, &offer));
         OfferStep::Ask(SourceOffer { source: id, key: key.public().clone() })
     }
 
@@ -114,7 +114,7 @@ impl Publishers {
         if publisher.granted(now, grant) == GrantEffect::Kept {
             return Some(GrantStep::Kept);
         }
-        let OfferedSource { id, class, reliable, .. } = *publisher;
+        let OfferedSource { id, class, reliable, calls, .. } = *publisher;
         // Only sources of the owner can be asked for missing messages.
         let recovery = RecoveryLimits::NONE;
         let (history_depth, history_bytes_max) = (0, 0);
@@ -122,7 +122,9 @@ impl Publishers {
         let receivers = grant.receiver.clone().map(|key| Arc::new(Receivers::of_caller(key)));
         let config =
             SourceConfig { name, id, class, reliable, history_depth, history_bytes_max, recovery, receivers };
-        let source = self.key(grant.suite).and_then(|key| Source::new(config, grant, key));
+        // Several publishers share the source of a topic, so none of them begins with it.
+        let make = if calls { Source::new } else { Source::midway };
+        let source = self.key(grant.suite).and_then(|key| make(config, grant, key));
         Some(GrantStep::Anew(source.map(|source| SourceSlot::new(source, false, reliable))))
     }
 
@@ -161,6 +163,8 @@ struct OfferedSource {
     id: SourceId,
     class: Class,
     reliable: bool,
+    /// Whether it calls a service.
+    calls: bool,
     /// Grant of the source's current key; `None` until the owner granted it.
     grant: Option<TopicGrant>,
     /// Key of the next epoch, and its beginning.
@@ -180,8 +184,9 @@ enum GrantEffect {
 
 impl OfferedSource {
     /// Creates the state before the first grant.
-    fn new(id: SourceId, class: Class, reliable: bool) -> Self {
-        Self { id, class, reliable, grant: None, next: None, watched: Vec::new() }
+    fn new(id: SourceId, offer: &Offer) -> Self {
+        let Offer { class, reliable, calls, .. } = *offer;
+        Self { id, class, reliable, calls, grant: None, next: None, watched: Vec::new() }
     }
 
     /// Handles a grant to publish, or a new epoch.

@@ -6,7 +6,7 @@
 use std::fmt::Write as _;
 
 use sgc_config::{Config, Recipient, ShareConfig};
-use sgc_ros::{Interface, Part, ShareRule};
+use sgc_ros::{DeadManRule, Interface, Part, ShareRule};
 use sgc_trust::{CaFingerprint, Grantees, Identity, Policy, VerifiedPeer};
 use sgc_wire::{GroupTag, Kind, Metadata, NodeId, Role};
 
@@ -95,7 +95,12 @@ fn first<T>(all: impl IntoIterator<Item = T>, omitted: &mut usize) -> Vec<T> {
 }
 
 /// Returns the route rules of a share, one for each topic and service.
-pub fn share_rules(share: &ShareConfig, identity: &Identity, partners: &Partners) -> Vec<ShareRule> {
+pub fn share_rules(
+    share: &ShareConfig,
+    dead_man: Option<&DeadManRule>,
+    identity: &Identity,
+    partners: &Partners,
+) -> Vec<ShareRule> {
     let whole = metadata(share, identity.node_name().as_str());
     let policy = policy(share, identity, partners);
     let rule = |part: &Part| ShareRule {
@@ -113,6 +118,7 @@ pub fn share_rules(share: &ShareConfig, identity: &Identity, partners: &Partners
         },
         suite: share.suite,
         class: share.priority,
+        dead_man: dead_man.cloned(),
         shaping: share.shaping,
         qos: share.qos,
         dedicated: share.dedicated,

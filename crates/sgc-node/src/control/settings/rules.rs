@@ -73,8 +73,12 @@ impl Rules {
             rules.add_token(config, identity, token, one, now)?;
         }
         let partners = &rules.partners;
-        rules.shares =
-            config.shares.iter().flat_map(|s| policy::share_rules(s, identity, partners)).collect();
+        let mut shares = Vec::new();
+        for one in &config.shares {
+            let dead_man = one.dead_man.as_ref().map(dead_man_rule).transpose()?;
+            shares.extend(policy::share_rules(one, dead_man.as_ref(), identity, partners));
+        }
+        rules.shares = shares;
         let mut of_fleet = Vec::new();
         for one in &config.uses {
             let dead_man = one.dead_man.as_ref().map(dead_man_rule).transpose()?;

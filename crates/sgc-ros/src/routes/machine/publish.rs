@@ -39,7 +39,7 @@ impl<R: RngCore> Routes<R> {
     }
 
     /// Changes a share, and carries out the effect on its writer for messages of others.
-    fn change_writer(
+    pub(super) fn change_writer(
         &mut self,
         name: &Name,
         change: impl FnOnce(&mut ShareRoute, &ShareRule) -> Option<Command>,

@@ -13,6 +13,7 @@ use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
 use crate::routes::command::Command;
 use crate::routes::problem::Cause;
 use crate::routes::rules::{Direction, Rules, ShareRule, ShareRules, UseRule, UseRuleId, UseRules};
+use crate::routes::share_route::ShareRoute;
 
 impl<R: RngCore> Routes<R> {
     /// Replaces the rules.
@@ -46,13 +47,17 @@ impl<R: RngCore> Routes<R> {
         for (name, index, before) in kept {
             let Some(route) = self.shares.get_mut(&name) else { continue };
             route.move_to(now, index, &self.share_rules[index]);
-            let ShareRule { policy, shaping, qos, .. } = &self.share_rules[index];
+            let ShareRule { policy, shaping, dead_man, qos, .. } = &self.share_rules[index];
             let has_other_qos = *qos != before.qos;
             if *policy != before.policy {
                 self.commands.push_back(Command::UpdatePolicy { name, policy: policy.clone() });
             }
             if *shaping != before.shaping {
                 self.commands.push_back(Command::Shape { name, shaping: *shaping });
+            }
+            if *dead_man != before.dead_man {
+                self.commands.push_back(Command::DeadMan { name, rule: dead_man.clone() });
+                self.change_writer(&name, ShareRoute::refresh_writer);
             }
             if has_other_qos {
                 self.refresh_share(name);

@@ -103,11 +103,15 @@ impl<R: RngCore> Routes<R> {
             self.backlog.wait();
             return problem;
         }
-        let shaping = share.shaping;
+        let (shaping, dead_man) = (share.shaping, share.dead_man.clone());
         let (spec, route) = ShareRoute::begin(name, rule, share, topic, &type_name, keyless, writer);
         self.shares.insert(name, route);
         self.commands.push_back(Command::Share(spec));
         self.shape(name, shaping);
+        if dead_man.is_some() {
+            self.dead_man(name, dead_man);
+            self.change_writer(&name, ShareRoute::refresh_writer);
+        }
         self.refresh_share(name);
         None
     }
