@@ -117,6 +117,11 @@ pub(crate) enum RuleFinding {
 /// A fact about an interface that this node shares.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum ShareFinding {
+    /// Its subscribers want no more than this.
+    Wished {
+        interval_us: Option<u64>,
+        bits_per_s: Option<u64>,
+    },
     /// The type of the rule is not that of the local programs.
     TypeDiffers {
         kind: Interface,

@@ -312,6 +312,13 @@ impl fmt::Display for ShareFinding {
                 f.write_str("no message has come from the local publishers since somebody asked for it")
             }
             Self::Published { messages } => write!(f, "{messages} messages were published to the far side"),
+            Self::Wished { interval_us, bits_per_s } => {
+                let rate = |us: u64| (1e9 / us.max(1) as f64).round() / 1e3;
+                let rate = interval_us.map(|us| format!("{} messages a second", rate(us)));
+                let bandwidth = bits_per_s.map(|bits| format!("{bits} bit/s"));
+                let most: Vec<_> = rate.into_iter().chain(bandwidth).collect();
+                write!(f, "no more than {} is sent, because no subscriber wants more", most.join(" and "))
+            }
             Self::Written { messages } => {
                 write!(f, "{messages} messages of others were given to the local network")
             }
@@ -354,6 +361,7 @@ impl ShareFinding {
             | Self::Direct { .. }
             | Self::Called
             | Self::Published { .. }
+            | Self::Wished { .. }
             | Self::Written { .. } => return None,
         })
     }

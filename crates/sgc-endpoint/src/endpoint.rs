@@ -14,7 +14,7 @@ use sgc_trust::{Identity, Policy, TrustAnchors, VerifiedPeer, verify_advert};
 use sgc_wire::{
     CatalogueSource, ClockWatch, Consumer, Control, Credentials, Name, NodeId, Now, OperationAnswer,
     OperationRequest, PathOffer, PathQuestion, Qos, RefuseReason, Report, ReportQuestion, SignedBody, SinkId,
-    SourceId, TopicGrant,
+    SourceId, TopicGrant, Wish,
 };
 
 use crate::config::EndpointConfig;
@@ -219,6 +219,12 @@ impl Endpoint {
         self.owner.set_consumers(&mut self.cx, consumers);
     }
 
+    /// Sets the most that this node wants of the topics of each owner. The owners that ask are told.
+    pub fn set_wishes(&mut self, now: Now, wishes: BTreeMap<NodeId, Vec<Wish>>) {
+        self.cx.set_now(now);
+        self.owner.set_wishes(&mut self.cx, wishes);
+    }
+
     /// Answers [`crate::Event::RenewAsked`], once or again after a change.
     pub fn answer_renewal(&mut self, now: Now, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
         self.cx.set_now(now);
@@ -355,6 +361,19 @@ impl Endpoint {
     pub fn leave_consumers(&mut self, now: Now, peer: &NodeId) {
         self.cx.set_now(now);
         self.joiner.leave_consumers(&mut self.cx, peer);
+    }
+
+    /// Asks a node for its wishes about this node's topics, until [`Self::leave_wishes`]. A node without wishes, or of a
+    /// version that has none, does not advertise the name of the question: then nothing happens.
+    pub fn ask_wishes(&mut self, now: Now, peer: NodeId) {
+        self.cx.set_now(now);
+        self.joiner.ask_wishes(&mut self.cx, peer);
+    }
+
+    /// Stops asking a node for its wishes.
+    pub fn leave_wishes(&mut self, now: Now, peer: &NodeId) {
+        self.cx.set_now(now);
+        self.joiner.leave_wishes(&mut self.cx, peer);
     }
 
     /// Asks a node of this fleet for a report, in place of an earlier question to it. Returns the name of the question,

@@ -106,6 +106,16 @@ impl Joiner {
         self.leave(cx, &BlindName::consumers(peer).name);
     }
 
+    /// Asks a node for its wishes about this node's topics, until [`Self::leave_wishes`].
+    pub(crate) fn ask_wishes(&mut self, cx: &mut Context, peer: NodeId) {
+        self.join(cx, BlindName::wishes(&peer).name, peer, JoinKind::Wishes);
+    }
+
+    /// Stops asking a node.
+    pub(crate) fn leave_wishes(&mut self, cx: &mut Context, peer: &NodeId) {
+        self.leave(cx, &BlindName::wishes(peer).name);
+    }
+
     /// Asks a node of this fleet for a report, in place of an earlier question. Returns the name of the question.
     pub(crate) fn ask_report(&mut self, cx: &mut Context, peer: NodeId, question: &ReportQuestion) -> Name {
         let BlindName { name, .. } = BlindName::reports(&peer);
@@ -362,6 +372,7 @@ impl Joiner {
         match (self.followed.get(&name), join.map(|j| (j.kind(), j.owner()))) {
             (Some(owner), _) => self.owner_lost(cx, *owner, reason),
             (None, Some((JoinKind::Consumers, peer))) => cx.event(Event::ConsumersLost { peer, reason }),
+            (None, Some((JoinKind::Wishes, peer))) => cx.event(Event::WishesLost { peer, reason }),
             (None, Some((kind, _))) if kind.is_question() => {}
             (None, _) => cx.event(Event::Lost { name, reason }),
         }
@@ -391,7 +402,7 @@ impl Joiner {
                 }
             }
             // A missing answer shows where it is needed.
-            (None, Some(JoinKind::Types(_) | JoinKind::Consumers | JoinKind::Clock)) => {}
+            (None, Some(JoinKind::Types(_) | JoinKind::Consumers | JoinKind::Wishes | JoinKind::Clock)) => {}
             (None, _) => cx.event(Event::Refused { name, by }),
         }
     }
@@ -440,6 +451,9 @@ impl Joiner {
             }
             (GrantContent::Consumers(consumers), Some(JoinKind::Consumers)) => {
                 cx.event(Event::Consumers { peer: owner, consumers });
+            }
+            (GrantContent::Wishes(wishes), Some(JoinKind::Wishes)) => {
+                cx.event(Event::Wishes { peer: owner, wishes });
             }
             _ => cx.unexpected(UnexpectedFrame::GrantKind),
         }

@@ -85,6 +85,8 @@ pub enum JoinKind {
     Types(Vec<Name>),
     /// To get a node's consumers of this node's interfaces.
     Consumers,
+    /// To get a node's wishes about this node's topics.
+    Wishes,
     /// To get a node's report: the answer to an encoded [`sgc_wire::ReportQuestion`].
     Report(Bytes),
     /// To get a node's addresses: the answer to an encoded [`sgc_wire::PathQuestion`].
@@ -106,14 +108,16 @@ impl JoinKind {
                 let question = TypeQuestion { names: names.clone() };
                 Request::Ask { what: question.to_vec().into() }
             }
-            Self::Consumers | Self::Clock => Request::Ask { what: Bytes::new() },
+            Self::Consumers | Self::Wishes | Self::Clock => Request::Ask { what: Bytes::new() },
         }
     }
 
     /// Returns whether one answer ends the join: no data flows, and no better route is looked for.
     pub(crate) fn is_question(&self) -> bool {
         match self {
-            Self::Subscribe { .. } | Self::Publish(_) | Self::Follow | Self::Consumers => false,
+            Self::Subscribe { .. } | Self::Publish(_) | Self::Follow | Self::Consumers | Self::Wishes => {
+                false
+            }
             Self::Renew(_)
             | Self::Operate(_)
             | Self::Types(_)

@@ -2,7 +2,7 @@
 
 use sgc_trust::{
     Identity, TopicSecret, clock_blind, consumers_blind, name_of, operations_blind, paths_blind,
-    renewal_blind, reports_blind, types_blind,
+    renewal_blind, reports_blind, types_blind, wishes_blind,
 };
 use sgc_wire::{Blind, Metadata, Name, NodeId};
 
@@ -36,6 +36,11 @@ impl BlindName {
     /// Returns the name at which `node` is asked for its addresses.
     pub(crate) fn paths(node: &NodeId) -> Self {
         Self::new(node, paths_blind(node))
+    }
+
+    /// Returns the name at which `node` is asked for its wishes.
+    pub(crate) fn wishes(node: &NodeId) -> Self {
+        Self::new(node, wishes_blind(node))
     }
 
     /// Returns the name at which `node` is asked for the time by its clock.

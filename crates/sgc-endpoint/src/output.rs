@@ -6,7 +6,7 @@ use std::time::Instant;
 use sgc_trust::{GrantError, SignedError};
 use sgc_wire::{
     Catalogue, Consumer, Control, Credentials, DescribedType, Name, NodeId, OperationAnswer, PathOffer,
-    Recover, RefuseReason, Report, Role, SinkId, SourceId, TopicGrant, UnixMillis,
+    Recover, RefuseReason, Report, Role, SinkId, SourceId, TopicGrant, UnixMillis, Wish,
 };
 
 use crate::joins::{LostReason, RefusedBy};
@@ -236,6 +236,20 @@ pub enum Event {
     },
     /// A node does not report its consumers any more, until the next [`Event::Consumers`].
     ConsumersLost {
+        /// The node.
+        peer: NodeId,
+        /// The reason.
+        reason: LostReason,
+    },
+    /// A node told its wishes about this node's topics: all of them, and again after each change.
+    Wishes {
+        /// The node.
+        peer: NodeId,
+        /// Its wishes.
+        wishes: Vec<Wish>,
+    },
+    /// A node does not tell its wishes any more, until the next [`Event::Wishes`].
+    WishesLost {
         /// The node.
         peer: NodeId,
         /// The reason.

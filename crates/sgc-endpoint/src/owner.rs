@@ -4,9 +4,9 @@
 mod adverts;
 mod askers;
 mod catalogue;
-mod consumers;
 mod granted;
 mod member_requests;
+mod news;
 mod share;
 mod shares;
 mod types;
@@ -19,7 +19,7 @@ use bytes::Bytes;
 use sgc_trust::{Kem, Policy, TopicSecret, VerifiedPeer, name_of, verify_join};
 use sgc_wire::{
     CatalogueSource, Consumer, Credentials, Decode, GrantContent, JoinBody, Name, NodeId, OperationAnswer,
-    PathOffer, Qos, Recover, RefuseReason, Report, Request, SignedBody, SinkId, SourceId, TopicGrant,
+    PathOffer, Qos, Recover, RefuseReason, Report, Request, SignedBody, SinkId, SourceId, TopicGrant, Wish,
 };
 
 pub use self::adverts::{ADVERT_INTERVAL, ADVERTS_BURST};
@@ -27,9 +27,9 @@ pub use self::share::{ShareError, ShareSpec};
 
 use self::adverts::Adverts;
 use self::catalogue::CatalogueFeed;
-use self::consumers::ConsumerReports;
 use self::granted::GrantedSink;
 use self::member_requests::{MemberRequest, MemberRequests};
+use self::news::News;
 use self::share::Share;
 use self::shares::Shares;
 use self::types::TypeAnswers;
@@ -59,6 +59,7 @@ enum Desk {
     Operations,
     Types,
     Consumers,
+    Wishes,
     Reports,
     Paths,
     Clock,
@@ -83,7 +84,8 @@ pub(crate) struct Owner {
     renewals: MemberRequests,
     operations: MemberRequests,
     types: TypeAnswers,
-    consumers: ConsumerReports,
+    consumers: News<Consumer>,
+    wishes: News<Wish>,
     reports: MemberRequests,
     paths: MemberRequests,
     /// The name at which this node tells the time, if it does.
@@ -106,7 +108,8 @@ impl Owner {
             renewals: MemberRequests::new(renewals, cx.limits().sinks_per_name_max),
             operations: MemberRequests::new(operations, OPERATIONS_ASKED_MAX),
             types: TypeAnswers::new(&own),
-            consumers: ConsumerReports::new(&own),
+            consumers: News::new(&own),
+            wishes: News::new(&own),
             reports: MemberRequests::new(None, REPORTS_ASKED_MAX),
             paths: MemberRequests::new(None, PATHS_ASKED_MAX).with_partners(),
             clock: None,
@@ -202,6 +205,7 @@ impl Owner {
         ended.for_each(|blind| self.adverts.withdraw(blind));
         self.types.withdraw(&mut self.adverts);
         self.consumers.withdraw(&mut self.adverts);
+        self.wishes.withdraw(&mut self.adverts);
         self.withhold_reports();
         self.withhold_paths();
         self.clock.take().into_iter().for_each(|name| self.adverts.withdraw(name.blind));
@@ -226,6 +230,11 @@ impl Owner {
     /// Sets the consumers of this node, by the owner of the used interface.
     pub(crate) fn set_consumers(&mut self, cx: &mut Context, consumers: BTreeMap<NodeId, Vec<Consumer>>) {
         self.consumers.set(cx, &mut self.adverts, consumers);
+    }
+
+    /// Sets the most that this node wants of the topics of each owner.
+    pub(crate) fn set_wishes(&mut self, cx: &mut Context, wishes: BTreeMap<NodeId, Vec<Wish>>) {
+        self.wishes.set(cx, &mut self.adverts, wishes);
     }
 
     /// Answers a member that asks for a certificate, once or again after a change.
@@ -344,10 +353,12 @@ impl Owner {
     pub(crate) fn advertise_all(&mut self) {
         let types = self.types.is_advertised().then(|| self.types.name().blind);
         let consumers = self.consumers.is_advertised().then(|| self.consumers.name().blind);
+        let wishes = self.wishes.is_advertised().then(|| self.wishes.name().blind);
         let asked = [&self.renewals, &self.operations, &self.reports, &self.paths];
         let asked = asked.into_iter().filter_map(MemberRequests::blind);
         let clock = self.clock.map(|name| name.blind);
-        let fixed = self.catalogue.blinds().chain(asked).chain(types).chain(consumers).chain(clock);
+        let fixed =
+            self.catalogue.blinds().chain(asked).chain(types).chain(consumers).chain(wishes).chain(clock);
         self.adverts.add_all(fixed.chain(self.shares.iter().map(Share::blind)));
     }
 
@@ -404,6 +415,7 @@ impl Owner {
         self.operations.enforce(cx);
         self.types.enforce(cx);
         self.consumers.enforce(cx);
+        self.wishes.enforce(cx);
         self.reports.enforce(cx);
         self.paths.enforce(cx);
     }
@@ -465,6 +477,7 @@ impl Owner {
             Some(Desk::Clock) => tell_time(cx, name, sink, asked),
             Some(Desk::Types) => self.types.handle_question(cx, &self.shares, sink, asked),
             Some(Desk::Consumers) => self.consumers.handle_question(cx, sink, asked),
+            Some(Desk::Wishes) => self.wishes.handle_question(cx, sink, asked),
             Some(Desk::Share) => {
                 if let Some(share) = self.shares.get_mut(&name) {
                     share.handle_request(cx, sink, asked);
@@ -489,6 +502,7 @@ impl Owner {
             Some(Desk::Clock) => {}
             Some(Desk::Types) => self.types.handle_leave(sink),
             Some(Desk::Consumers) => self.consumers.handle_leave(sink),
+            Some(Desk::Wishes) => self.wishes.handle_leave(sink),
             Some(Desk::Share) => {
                 if let Some(share) = self.shares.get_mut(&name) {
                     share.handle_leave(cx, sink);
@@ -530,6 +544,8 @@ impl Owner {
             Some(Desk::Types)
         } else if self.consumers.name().name == *name {
             Some(Desk::Consumers)
+        } else if self.wishes.name().name == *name {
+            Some(Desk::Wishes)
         } else {
             self.shares.contains(name).then_some(Desk::Share)
         }

@@ -19,7 +19,7 @@ use sgc_wire::{
     MessageHead, MessageKind, Metadata, Name, OperationAnswer, PathCandidate, PathOffer, PayloadEncoding,
     PayloadForm, Place, Qos, Recover, RefuseReason, RejectReason, Report, ReportQuestion, Request, Role,
     RosNode, SecretBytes, SecretGeneration, SignedBody, SinkId, SourceId, SourceOffer, TopicGrant,
-    TypeQuestion, UnixMillis,
+    TypeQuestion, UnixMillis, Wish,
 };
 use sgc_zenoh::{Attachment, Gid, ZenohId};
 
@@ -288,6 +288,9 @@ fn bodies() -> Vec<Vec<u8>> {
     let offer = PathOffer { attempt: 1, user: [2; 4], password, candidates: vec![candidate] };
     all.push((3, GrantContent::Path(offer).to_vec()));
     all.push((3, GrantContent::Clock(NOW).to_vec()));
+    let (interval, bits_per_s) = (Some(Duration::from_millis(200)), Some(1_000_000));
+    let wish = Wish { interface: NAME, interval, bits_per_s };
+    all.push((3, GrantContent::Wishes(vec![wish]).to_vec()));
     all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
 }
 

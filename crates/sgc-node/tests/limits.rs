@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "support/lab.rs"]
+mod lab;
 mod support;
 
 use std::net::UdpSocket;
@@ -10,7 +12,8 @@ use std::sync::mpsc::channel;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use sgc_node::config::{Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata};
+use lab::{Lab, Stream};
+use sgc_node::config::{Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
 use sgc_trust::Suite;
 use sgc_wire::{Class, History, Qos, Reliability};
 use support::*;
@@ -247,4 +250,42 @@ fn commands_overtake_images_on_a_full_link() {
     let videos = hears_videos.drain().iter().filter(|v| v.len() == IMAGE_BYTES).count();
     assert!(videos >= 4, "{videos} videos beside {} images", heard.load(SeqCst));
     drop((robot, desk));
+}
+
+#[test]
+fn an_owner_sends_no_more_than_its_most_demanding_subscriber_wants() {
+    const HOUR: Option<Duration> = Some(Duration::from_secs(3600));
+    let lab = Lab::new(&["robot", "desk", "recorder"]);
+    let _cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![lab::share("/scan", &["desk", "recorder"])]);
+    let uses = |interval| {
+        let shaping = Shaping { interval, ..Shaping::default() };
+        vec![UseConfig { shaping, ..lab::uses("/scan") }]
+    };
+    let desk = lab.start("desk", |c| c.uses = uses(HOUR));
+    let stream = Stream::start(lab.talker("robot", "/scan"));
+    let sent = || robot.status()["routes"][0]["messages"].as_u64().unwrap();
+    let sends_nothing = || {
+        let (before, said) = (sent(), stream.said());
+        wait("more is said", || stream.said() > said + 100);
+        sent() == before
+    };
+    let (desk_hears, recorder_hears) = (lab.listener("desk", "/scan"), lab.listener("recorder", "/scan"));
+    desk_hears.samples.recv_timeout(PATIENCE).expect("the first one");
+    wait("the robot sends no more than the desk wants", sends_nothing);
+
+    // A subscriber that wants everything gets everything, whatever the other one wants.
+    let recorder = lab.start("recorder", |c| c.uses = uses(None));
+    let first = recorder_hears.samples.recv_timeout(PATIENCE).expect("everything");
+    let first: u64 = std::str::from_utf8(&first).unwrap().parse().unwrap();
+    lab::hears_each(&recorder_hears, first + 1, first + 200);
+    assert!(desk_hears.drain().len() <= 1, "the desk has its own limit");
+
+    // It goes, or the desk wants more.
+    recorder.stop();
+    wait("the robot sends no more than the desk wants", sends_nothing);
+    desk.reload(|c| c.uses = uses(None));
+    let before = sent();
+    wait("the robot sends everything", || sent() > before + 200);
+    stream.end();
 }

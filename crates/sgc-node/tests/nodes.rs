@@ -57,9 +57,9 @@ fn a_topic_goes_on_as_often_as_both_ends_let_it() {
         let heard = heard.iter().filter(|message| !message.starts_with(b"warm")).count();
         assert!(heard <= most, "{topic}: {heard} of {most}");
     }
-    for node in [robot, desk] {
-        assert!(node.status()["drops"]["thinned"].as_u64().unwrap() > 100, "{}", node.status()["drops"]);
-    }
+    // The robot leaves out most of both, since nobody wants more.
+    assert!(robot.drops("thinned") > 400, "{}", robot.status()["drops"]);
+    drop(desk);
 }
 
 #[test]

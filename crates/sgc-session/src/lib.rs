@@ -40,7 +40,7 @@ pub use port_mapping::{
     GrantedMapping, MAPPING_LIFETIME, MapperOutput, MappingFailure, MappingProtocol, MappingTarget,
     PortMapper,
 };
-pub use shaper::Shaper;
+pub use shaper::{Shaper, Wished};
 pub use supervisor::{
     DOUBT_AFTER, DialCause, Event, LinkFacts, LinkKey, LinkSupervisor, NETWORK_NEWS_MAX, Output,
     UNDISTURBED_MAX,

@@ -9,21 +9,94 @@ use sgc_ros::Shaping;
 /// Delay of timers and schedulers that costs a topic no bandwidth.
 const SLACK: Duration = Duration::from_millis(50);
 
+/// The most that the subscribers of a topic wish together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Wished {
+    /// Least time between two messages.
+    pub interval: Option<Duration>,
+    /// Most bits of payload a second.
+    pub bits_per_s: Option<u64>,
+}
+
+impl Wished {
+    /// Returns what satisfies both: the more of each. No subscriber gets less than it wishes because of another.
+    #[must_use]
+    pub fn or_more(self, other: Self) -> Self {
+        Self {
+            interval: self.interval.zip(other.interval).map(|(a, b)| a.min(b)),
+            bits_per_s: self.bits_per_s.zip(other.bits_per_s).map(|(a, b)| a.max(b)),
+        }
+    }
+}
+
 /// Decides when the next message of a topic may leave.
 #[derive(Debug, Default)]
 pub struct Shaper {
     shaping: Shaping,
+    limits: Pacer,
+    /// What the subscribers wish: messages that exceed it give way, reliable ones too, because nobody wants them.
+    wished: Pacer,
+    age: Age,
+}
+
+/// A limit of rate and bandwidth.
+#[derive(Debug, Default)]
+struct Pacer {
+    interval: Option<Duration>,
+    bits_per_s: Option<u64>,
     /// Time allowed by the rate.
     rate_due: Option<Instant>,
     /// Time allowed by the bandwidth.
     bandwidth_due: Option<Instant>,
-    age: Age,
+}
+
+impl Pacer {
+    fn new(interval: Option<Duration>, bits_per_s: Option<u64>) -> Self {
+        Self { interval, bits_per_s, ..Self::default() }
+    }
+
+    fn due(&self) -> Option<Instant> {
+        self.rate_due.max(self.bandwidth_due)
+    }
+
+    fn takes(&mut self, now: Instant, bytes: usize) {
+        if let Some(interval) = self.interval {
+            let next = self.rate_due.map(|due| due + interval).filter(|next| *next > now);
+            self.rate_due = Some(next.unwrap_or(now + interval));
+        }
+        if let Some(bits_per_s) = self.bits_per_s {
+            let earliest = now.checked_sub(SLACK).unwrap_or(now);
+            let begins = self.bandwidth_due.map_or(now, |due| due.max(earliest));
+            self.bandwidth_due = Some(begins + time_of(bytes, bits_per_s));
+        }
+    }
+
+    fn corrects(&mut self, taken: usize, left: usize) {
+        if let (Some(due), Some(bits_per_s)) = (&mut self.bandwidth_due, self.bits_per_s) {
+            let took = time_of(taken.abs_diff(left), bits_per_s);
+            *due = if left > taken { *due + took } else { due.checked_sub(took).unwrap_or(*due) };
+        }
+    }
+}
+
+/// Returns the time that a payload takes at a bandwidth.
+fn time_of(bytes: usize, bits_per_s: u64) -> Duration {
+    Duration::from_secs_f64(bytes as f64 * 8.0 / bits_per_s.max(1) as f64)
 }
 
 impl Shaper {
     /// Replaces the settings.
     pub fn set(&mut self, shaping: Shaping) {
-        *self = Self { shaping, ..Self::default() };
+        self.shaping = shaping;
+        self.limits = Pacer::new(shaping.interval, shaping.bits_per_s);
+        self.age = Age::default();
+    }
+
+    /// Sets what the subscribers wish. The same wishes change nothing.
+    pub fn wish(&mut self, wished: Wished) {
+        if wished != self.wished() {
+            self.wished = Pacer::new(wished.interval, wished.bits_per_s);
+        }
     }
 
     /// Returns the settings.
@@ -31,10 +104,15 @@ impl Shaper {
         &self.shaping
     }
 
-    /// Returns the time at which a message may leave. A message that waits for the rate is replaced by the next. One
-    /// that waits for bandwidth is replaced only if it is best effort.
+    /// Returns what the subscribers wish.
+    pub fn wished(&self) -> Wished {
+        Wished { interval: self.wished.interval, bits_per_s: self.wished.bits_per_s }
+    }
+
+    /// Returns the time at which a message may leave. A message that waits for the rate, or for what the subscribers
+    /// wish, is replaced by the next. One that waits for bandwidth is replaced only if it is best effort.
     pub fn due(&self) -> Option<Instant> {
-        self.rate_due.max(self.bandwidth_due)
+        self.limits.due().max(self.wished.due())
     }
 
     /// Returns `true` if a message may leave now.
@@ -44,35 +122,28 @@ impl Shaper {
 
     /// Returns `true` if a waiting message is replaced by the next one.
     pub fn gives_way(&self, now: Instant, reliable: bool) -> bool {
-        !reliable || self.rate_due.is_some_and(|due| due > now)
+        let waits = |due: Option<Instant>| due.is_some_and(|due| due > now);
+        !reliable || waits(self.limits.rate_due) || waits(self.wished.due())
     }
 
     /// Returns `true` if the settings let later messages replace one that waits.
     pub fn thins(&self, reliable: bool) -> bool {
-        self.shaping.interval.is_some() || (!reliable && self.shaping.bits_per_s.is_some())
+        self.shaping.interval.is_some()
+            || self.wished() != Wished::default()
+            || (!reliable && self.shaping.bits_per_s.is_some())
     }
 
     /// Charges a message that leaves. The next one is due relative to this one's due time, so that the configured rate
     /// is met.
     pub fn takes(&mut self, now: Instant, bytes: usize) {
-        if let Some(interval) = self.shaping.interval {
-            let next = self.rate_due.map(|due| due + interval).filter(|next| *next > now);
-            self.rate_due = Some(next.unwrap_or(now + interval));
-        }
-        if let Some(bits_per_s) = self.shaping.bits_per_s {
-            let took = Duration::from_secs_f64(bytes as f64 * 8.0 / bits_per_s.max(1) as f64);
-            let earliest = now.checked_sub(SLACK).unwrap_or(now);
-            let begins = self.bandwidth_due.map_or(now, |due| due.max(earliest));
-            self.bandwidth_due = Some(begins + took);
-        }
+        self.limits.takes(now, bytes);
+        self.wished.takes(now, bytes);
     }
 
     /// Corrects the charge, because the message's final length differs.
     pub fn corrects(&mut self, taken: usize, left: usize) {
-        if let (Some(due), Some(bits_per_s)) = (&mut self.bandwidth_due, self.shaping.bits_per_s) {
-            let took = Duration::from_secs_f64(taken.abs_diff(left) as f64 * 8.0 / bits_per_s.max(1) as f64);
-            *due = if left > taken { *due + took } else { due.checked_sub(took).unwrap_or(*due) };
-        }
+        self.limits.corrects(taken, left);
+        self.wished.corrects(taken, left);
     }
 
     /// Returns `true` if a message is too old by its publisher's time stamp and this node's clock, both in ns since
@@ -107,6 +178,37 @@ mod tests {
     #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
 
     use super::*;
+
+    #[test]
+    fn what_the_subscribers_wish_limits_reliable_topics_too_and_holds_nobody_up() {
+        let mut shaper = Shaper::default();
+        let begin = Instant::now();
+        shaper.wish(Wished { interval: Some(ms(100)), bits_per_s: None });
+        let times = went(&mut shaper, begin, 10, 100);
+        assert!(times.len() == 600 && shaper.gives_way(begin + ms(59_950), true), "{}", times.len());
+        shaper.wish(Wished { interval: None, bits_per_s: Some(8_000) });
+        shaper.takes(begin, 1000);
+        assert!(!shaper.is_due(begin + ms(900)) && shaper.gives_way(begin + ms(900), true));
+        assert!(shaper.is_due(begin + ms(1000)));
+        // The same wishes change nothing, and no wishes end the limit.
+        shaper.wish(Wished { interval: None, bits_per_s: Some(8_000) });
+        assert!(!shaper.is_due(begin + ms(900)));
+        shaper.wish(Wished::default());
+        assert!(shaper.is_due(begin));
+        // A limit of the configuration stays.
+        shaper.set(Shaping { bits_per_s: Some(8_000), ..Shaping::default() });
+        shaper.takes(begin, 1000);
+        assert!(!shaper.is_due(begin + ms(900)) && !shaper.gives_way(begin + ms(900), true));
+    }
+
+    #[test]
+    fn nobody_gets_less_because_of_the_wishes_of_others() {
+        let slow = Wished { interval: Some(ms(500)), bits_per_s: Some(1000) };
+        let quick = Wished { interval: Some(ms(100)), bits_per_s: None };
+        assert_eq!(slow.or_more(quick), Wished { interval: Some(ms(100)), bits_per_s: None });
+        assert_eq!(quick.or_more(slow), slow.or_more(quick));
+        assert_eq!(slow.or_more(Wished::default()), Wished::default());
+    }
 
     fn shaper(shaping: Shaping) -> (Shaper, Instant) {
         let mut shaper = Shaper::default();

@@ -13,7 +13,7 @@ use sgc_trust::{Identity, TopicSecret, derive_name, name_of, paths_blind};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Consumer, Control, Decode, Encode, JoinBody, LinkStateBody,
     Metadata, Name, NodeId, Packet, Qos, RefuseReason, Report, ReportQuestion, Role, RosNode, SinkId,
-    SourceId, SourceOffer,
+    SourceId, SourceOffer, Wish,
 };
 
 use crate::cast::{Member, identity};
@@ -578,6 +578,32 @@ impl World {
         let (now, id) = (self.now_at(node), self.identity(other).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
             running.endpoint.ask_clock(now, id);
+        }
+        self.settle(node);
+    }
+
+    /// Sets what a node wants of the topics of others: the owner, the topic, and the least time between two messages.
+    pub fn set_wishes(&mut self, node: NodeKey, wishes: &[(NodeKey, &str, Duration)]) {
+        self.note(format!("wishes {node:?}:{wishes:?}"));
+        let now = self.now_at(node);
+        let mut by_owner = BTreeMap::<_, Vec<_>>::new();
+        for (owner, topic, interval) in wishes {
+            let (interface, interval) = (self.name(*owner, topic), Some(*interval));
+            let wish = Wish { interface, interval, bits_per_s: None };
+            by_owner.entry(self.identity(*owner).node_id()).or_default().push(wish);
+        }
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.set_wishes(now, by_owner);
+        }
+        self.settle(node);
+    }
+
+    /// Asks another node for its wishes about what this one owns.
+    pub fn ask_wishes(&mut self, node: NodeKey, other: NodeKey) {
+        self.note(format!("ask wishes {node:?} {other:?}"));
+        let (now, id) = (self.now_at(node), self.identity(other).node_id());
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.ask_wishes(now, id);
         }
         self.settle(node);
     }

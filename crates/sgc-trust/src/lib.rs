@@ -69,7 +69,7 @@ pub use member::Membership;
 pub use message_key::{MessageKey, MessageKeyError};
 pub use names::{
     TopicSecret, clock_blind, consumers_blind, derive_name, name_of, operations_blind, paths_blind,
-    renewal_blind, reports_blind, types_blind,
+    renewal_blind, reports_blind, types_blind, wishes_blind,
 };
 pub use peer::{SignatureError, VerifiedPeer, node_id};
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};

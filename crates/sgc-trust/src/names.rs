@@ -112,6 +112,12 @@ pub fn clock_blind(node: &NodeId) -> Blind {
     blind_of(b"sgc clock v1", &node.0)
 }
 
+/// Returns the blind for an owner's question to a node about its wishes: everyone who knows the node can derive it, also
+/// owners of other fleets.
+pub fn wishes_blind(node: &NodeId) -> Blind {
+    blind_of(b"sgc wishes v1", &node.0)
+}
+
 /// Returns `SHA-256(label ‖ id)`, a blind that needs no secret.
 fn blind_of(label: &[u8], id: &[u8]) -> Blind {
     let mut context = digest::Context::new(&digest::SHA256);

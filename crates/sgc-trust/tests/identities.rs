@@ -123,6 +123,14 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
         name_of(&owner, &clock_blind(&owner)).to_string(),
         "26150ea05f92931e372e3b3227e64e7b399bd4122e6576104a2b507e33def622"
     );
+    assert_eq!(
+        wishes_blind(&owner).to_string(),
+        "05f8514905585ad0fc74ff2698f03a14e24cdf70bc5ef71a734d7a30a20eb357"
+    );
+    assert_eq!(
+        name_of(&owner, &wishes_blind(&owner)).to_string(),
+        "8bbbe9a5f3ed904eb23cd15d66c1660bdedfc610563ad0d35046b36a93d798ef"
+    );
 }
 
 #[test]

@@ -16,6 +16,7 @@ use crate::qos::Qos;
 use crate::report::Report;
 use crate::ros_node::RosNode;
 use crate::type_descriptions::{DescribedType, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX};
+use crate::wish::{WISHES_MAX, Wish};
 
 /// Most entries of one catalogue.
 pub const CATALOGUE_ENTRIES_MAX: usize = 2048;
@@ -51,6 +52,8 @@ pub enum GrantContent {
     Path(PathOffer),
     /// The time by a node's clock.
     Clock(UnixMillis),
+    /// The most that a node wants of the topics of the owner that asked.
+    Wishes(Vec<Wish>),
 }
 
 /// One epoch of one topic.
@@ -229,6 +232,10 @@ impl Encode for GrantContent {
                 w.u8(8);
                 time.encode(w);
             }
+            Self::Wishes(wishes) => {
+                w.u8(9);
+                w.list(wishes, |w, wish| wish.encode(w));
+            }
         }
     }
 }
@@ -264,6 +271,7 @@ impl Decode for GrantContent {
             6 => Ok(Self::Report(Report::decode(r)?)),
             7 => Ok(Self::Path(PathOffer::decode(r)?)),
             8 => Ok(Self::Clock(UnixMillis::decode(r)?)),
+            9 => Ok(Self::Wishes(r.list("wishes", WISHES_MAX, Wish::decode)?)),
             v => Err(DecodeError::value("grant content", v.into())),
         }
     }

@@ -21,6 +21,7 @@ mod report;
 mod ros_node;
 mod slab;
 mod type_descriptions;
+mod wish;
 
 pub use catalogue::{
     CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Credentials, ENTRY_SOURCES_MAX,
@@ -66,3 +67,4 @@ pub use slab::Slab;
 pub use type_descriptions::{
     DescribedType, TYPE_DESCRIPTION_BYTES_MAX, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX, TypeQuestion,
 };
+pub use wish::{WISHES_MAX, Wish};

@@ -167,6 +167,10 @@ fn walk_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: bool, 
     } else if provides {
         steps.push(fine(ShareFinding::Published { messages: route.messages }));
     }
+    let (interval_us, bits_per_s) = (route.wished_interval_us, route.wished_bits_per_s);
+    if interval_us.is_some() || bits_per_s.is_some() {
+        steps.push(fine(ShareFinding::Wished { interval_us, bits_per_s }));
+    }
     traffic(&line, Direction::Shared, steps);
     if steps.iter().any(|step| step.verdict == Verdict::Wrong) {
         return;

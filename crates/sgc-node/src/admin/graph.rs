@@ -363,6 +363,10 @@ pub struct ShareRoute {
     pub written: u64,
     /// Number of local readers that get far messages.
     pub matched: u32,
+    /// Least time between two messages that its subscribers wish, microseconds; null without a limit.
+    pub wished_interval_us: Option<u64>,
+    /// Most bits of payload a second that its subscribers wish; null without a limit.
+    pub wished_bits_per_s: Option<u64>,
     /// Dead-man switch of far messages, if there is one.
     pub dead_man: Option<DeadMan>,
     /// Whether messages published here travel as JSON.

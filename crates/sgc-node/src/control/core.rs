@@ -19,6 +19,7 @@ mod services;
 mod status;
 mod trust;
 mod types;
+mod wishes;
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -60,6 +61,7 @@ use crate::control::parts::publishers::Publishers;
 use crate::control::parts::services::Services;
 use crate::control::parts::shares::Shares;
 use crate::control::parts::sinks::Sinks;
+use crate::control::parts::wishes::Wishes;
 use crate::control::peers::control_queue::Inbox;
 use crate::control::peers::peer_rate::PeerRates;
 use crate::control::types::interface_types::InterfaceTypes;
@@ -125,6 +127,8 @@ pub(crate) struct Core<N: RosNetwork> {
     publishers: Publishers,
     /// Local publishers that were there before this node.
     newcomers: Newcomers,
+    /// The most that nodes want of each other's topics.
+    wishes: Wishes,
     /// Set if this node is the authority of its fleet.
     authority: Option<Authority>,
     /// Operations that users of this node request.
@@ -271,6 +275,7 @@ impl<N: RosNetwork> Core<N> {
             consumers: FarConsumers::default(),
             publishers: Publishers::new(parts.message_keys),
             newcomers: Newcomers::new(Instant::now()),
+            wishes: Wishes::default(),
             authority: parts.authority,
             operations: Operations::default(),
             gateway: parts.gateway,
@@ -534,7 +539,7 @@ impl<N: RosNetwork> Core<N> {
                     output => self.router_output(output),
                 }
             };
-            let mut progressed = self.drain_direct() | self.drain_clocks();
+            let mut progressed = self.drain_direct() | self.drain_clocks() | self.settle_wishes();
             let endpoint = loop {
                 match self.endpoint.poll_output() {
                     EndpointOutput::Timeout(at) => break at,

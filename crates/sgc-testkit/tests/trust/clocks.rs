@@ -1,8 +1,8 @@
-//! Nodes tell each other the time by their clocks.
+//! Nodes tell each other the time by their clocks, and what they want of each other's topics.
 
 use std::time::Duration;
 
-use sgc_endpoint::Event;
+use sgc_endpoint::{Event, LostReason};
 use sgc_testkit::{NodeKey, World};
 use sgc_wire::UnixMillis;
 
@@ -45,4 +45,40 @@ fn nodes_learn_the_time_of_others_as_often_as_they_ask() {
         }
         world.ask_clock(*desk, *arm);
     }
+}
+
+/// Returns the least times between two messages that a node is wished, in each answer that it got.
+fn wished(world: &World, node: NodeKey) -> Vec<Vec<Option<Duration>>> {
+    let of_answer = |(event, _): (&Event, _)| {
+        let Event::Wishes { wishes, .. } = event else { return None };
+        Some(wishes.iter().map(|wish| wish.interval).collect())
+    };
+    crate::events(world, node, 0).filter_map(of_answer).collect()
+}
+
+#[test]
+fn an_owner_learns_what_others_want_of_its_topics_and_of_no_others() {
+    let mut scene = flowing(221);
+    let Scene { world, arm, desk, lap, .. } = &mut scene;
+    for owner in [*arm, *lap] {
+        world.ask_wishes(owner, *desk);
+    }
+    world.run(ms(1000));
+    assert!(wished(world, *arm).is_empty(), "it wishes nothing");
+    world.set_wishes(*desk, &[(*arm, "/chatter", ms(200))]);
+    world.run(ms(1000));
+    assert_eq!((wished(world, *arm), wished(world, *lap)), (vec![vec![Some(ms(200))]], vec![vec![]]));
+    world.set_wishes(*desk, &[(*arm, "/chatter", ms(500))]);
+    world.run(ms(1000));
+    world.set_wishes(*desk, &[]);
+    world.run(ms(1000));
+    assert_eq!(wished(world, *arm)[1..], [vec![Some(ms(500))], vec![]]);
+    assert_eq!(wished(world, *lap).len(), 1, "nothing of its own changed");
+    world.shut_down(*desk);
+    world.run(ms(1000));
+    let lost = crate::events(world, *arm, 0).filter_map(|(event, _)| match event {
+        Event::WishesLost { reason, .. } => Some(*reason),
+        _ => None,
+    });
+    assert!(lost.into_iter().any(|reason| reason == LostReason::Withdrawn));
 }

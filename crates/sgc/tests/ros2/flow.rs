@@ -7,7 +7,7 @@ use std::time::Duration;
 use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::lab::{Lab, Site, robot_to_desk};
+use crate::lab::{Lab, Site, robot_to_desk, share, uses};
 use crate::support::{Peer, eventually};
 use crate::{EXCLUSIVE, PAIRS, PLAN, count};
 
@@ -245,4 +245,27 @@ fn a_subscriber_that_stands_still_holds_up_nobody_else() {
     frozen.signal(Signal::CONT);
     assert_whole(&frozen.summary(), MESSAGES, "the one that stood still");
     talker.summary();
+}
+
+#[test]
+fn a_far_subscriber_that_wants_less_spares_the_wire() {
+    const MESSAGES: u64 = 1_000;
+    let used = uses("topic", "/load", "robot") + "max_rate = \"5Hz\"\n";
+    let lab = Lab::real(PLAN, [share("topic", "/load", "desk"), used]);
+    let topic = ["--topic", "/load", "--depth", "0", "--timeout", PLAN.peer_life];
+    let mut listener = lab.load(Site::Desk, "kilted", &[&["sub", "--verbose"], &topic[..]].concat());
+    let messages = MESSAGES.to_string();
+    let talk =
+        [&["pub", "--rate", "200", "--count", &messages, "--hold", PLAN.peer_life], &topic[..]].concat();
+    let mut talker = lab.load(Site::Robot, "jazzy", &talk);
+    talker.wait("all messages", |event| event["event"] == "all_sent");
+    // The newest one always comes.
+    listener.wait("the last message", |event| event["event"] == "received" && event["seq"] == MESSAGES - 1);
+    let sent = lab.status(Site::Robot)["routes"][0]["messages"].as_u64().unwrap();
+    assert!(sent < MESSAGES / 4, "{sent} messages left the robot");
+    let why = lab.why(Site::Robot, "/load");
+    assert!(
+        why.contains("no more than 5 messages a second is sent, because no subscriber wants more"),
+        "{why}"
+    );
 }

@@ -132,6 +132,7 @@ impl<N: RosNetwork> Core<N> {
             }
             let refused = self.refused.for_name(&route.name);
             let sink = self.sinks.get(&route.name);
+            let wished = self.shares.get(&route.name).map(|share| share.wished()).unwrap_or_default();
             share.routes.push(ShareRoute {
                 topic: route.local_name,
                 shared_as: Some(route.shared_as),
@@ -147,6 +148,10 @@ impl<N: RosNetwork> Core<N> {
                 messages: self.shares.get(&route.name).map_or(0, |share| share.published()),
                 written: sink.map_or(0, |sink| sink.delivered()),
                 matched: sink.map_or(0, |sink| sink.matched()),
+                wished_interval_us: wished
+                    .interval
+                    .map(|time| u64::try_from(time.as_micros()).unwrap_or(u64::MAX)),
+                wished_bits_per_s: wished.bits_per_s,
                 dead_man: sink.and_then(|sink| sink.dead_man()),
                 is_json: route.form == PayloadForm::Json,
                 lacks_definition: self.lacks_definition(&route.name, route.form),

@@ -147,6 +147,8 @@ impl<N: RosNetwork> Core<N> {
             Event::OwnGrant { name, grant } => self.own_grant(name, grant),
             Event::Consumers { peer, consumers } => self.consumers_told(now, peer, consumers),
             Event::ConsumersLost { peer, reason } => self.consumers_lost(now, peer, reason),
+            Event::Wishes { peer, wishes } => self.wishes_told(peer, &wishes),
+            Event::WishesLost { peer, reason } => self.wishes_lost(&peer, reason),
             Event::Types { owner, types } => self.types_told(owner, types),
             Event::Recover(recover) => {
                 if let Some(share) = self.shares.get(&recover.name)
@@ -203,12 +205,14 @@ impl<N: RosNetwork> Core<N> {
                     share.ask_in_marks(true);
                 }
                 self.consumers.sink_joined(now.instant, peer, name, sink, role);
+                self.wishes.subscribers_changed();
             }
             Event::SinkLeft { name, sink, peer } => {
                 debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
                 routes.handle_sink_left(now.instant, &name, &sink);
                 self.closings.lost_path(now.instant, name, peer);
                 self.consumers.sink_left(peer, name, sink, now.instant + UNREACHABLE_HOLD);
+                self.wishes.subscribers_changed();
             }
             Event::SinkCut { name, sink, peer, reason } => {
                 info!(
@@ -221,6 +225,7 @@ impl<N: RosNetwork> Core<N> {
                 routes.handle_sink_left(now.instant, &name, &sink);
                 self.closings.cut(&name, &peer);
                 self.consumers.sink_left(peer, name, sink, now.instant);
+                self.wishes.subscribers_changed();
             }
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
@@ -276,6 +281,8 @@ impl<N: RosNetwork> Core<N> {
             | Event::Types { .. }
             | Event::Consumers { .. }
             | Event::ConsumersLost { .. }
+            | Event::Wishes { .. }
+            | Event::WishesLost { .. }
             | Event::Followed { .. }
             | Event::Granted { .. } => {}
         }

@@ -139,6 +139,9 @@ impl<N: RosNetwork> Core<N> {
         // Messages of other publishers on our share are shaped by those publishers.
         if let Some(sink) = self.sinks.get(&name).filter(|_| self.shares.get(&name).is_none()) {
             sink.set_shaping(shaping);
+            if let Some(owner) = self.endpoint.owner_of(&name) {
+                self.wishes.set_own(name, owner, &shaping);
+            }
         }
     }
 
@@ -197,6 +200,7 @@ impl<N: RosNetwork> Core<N> {
         self.stop_publishing(&name);
         self.end_calls(&name);
         self.sinks.remove(&name);
+        self.wishes.left(&name);
     }
 
     /// Takes a new reader into use, unless the wish has changed meanwhile.

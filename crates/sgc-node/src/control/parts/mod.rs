@@ -12,7 +12,7 @@
 //!   about calls.
 //! - [`sinks`] closes the queues of writers, which ends the writers, and drops keys of past epochs.
 //!
-//! [`forward_table`], [`network_ends`] and [`newcomers`] only keep entries.
+//! [`forward_table`], [`network_ends`], [`newcomers`] and [`wishes`] only keep entries.
 
 pub(crate) mod certificates;
 pub(crate) mod closings;
@@ -26,3 +26,4 @@ pub(crate) mod services;
 pub(crate) mod shares;
 mod sink_timers;
 pub(crate) mod sinks;
+pub(crate) mod wishes;

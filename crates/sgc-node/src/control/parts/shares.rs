@@ -62,6 +62,11 @@ impl Shares {
         self.shares.values().for_each(|share| share.close());
     }
 
+    /// Iterates over the names that this node publishes under.
+    pub(crate) fn names(&self) -> impl Iterator<Item = Name> {
+        self.shares.keys().copied()
+    }
+
     pub(crate) fn get(&self, name: &Name) -> Option<&Arc<LocalShare>> {
         self.shares.get(name)
     }

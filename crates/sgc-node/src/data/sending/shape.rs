@@ -8,7 +8,7 @@ use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use sgc_ros::{Sample, SampleKind, Shaping};
-use sgc_session::Shaper;
+use sgc_session::{Shaper, Wished};
 use sgc_sync::lock;
 use sgc_wire::{Name, PayloadEncoding, PayloadForm};
 use tracing::warn;
@@ -75,10 +75,23 @@ impl ShapeStage {
         self.note_active(&state);
     }
 
+    /// Sets what the subscribers wish together.
+    pub(crate) fn wish(&self, wished: Wished) {
+        let mut state = lock(&self.state);
+        state.shaper.wish(wished);
+        self.note_active(&state);
+    }
+
+    /// Returns what the subscribers wish together.
+    pub(crate) fn wished(&self) -> Wished {
+        lock(&self.state).shaper.wished()
+    }
+
     /// Makes later samples pass this stage, or not. They pass it after the limits as well while it holds a sample,
     /// which would otherwise leave behind them.
     fn note_active(&self, state: &State) {
-        self.is_active.store(state.has_limits || state.held.is_some(), SeqCst);
+        let is_limited = state.has_limits || state.shaper.wished() != Wished::default();
+        self.is_active.store(is_limited || state.held.is_some(), SeqCst);
     }
 
     /// Returns the settings.

@@ -13,6 +13,7 @@ use arc_swap::ArcSwap;
 use bytes::Bytes;
 use sgc_endpoint::Source;
 use sgc_ros::{Guid, Sample, SampleKind, Shaping};
+use sgc_session::Wished;
 use sgc_sync::lock;
 use sgc_wire::{MessageHead, MessageKind, Name, Recover, SinkId, SourceId, TopicGrant};
 use tokio::runtime::Handle;
@@ -143,6 +144,16 @@ impl LocalShare {
             // Samples that waited for conversion need none any more.
             self.publish_waiting();
         }
+    }
+
+    /// Sets what the subscribers wish together.
+    pub(crate) fn wish(&self, wished: Wished) {
+        self.shape.wish(wished);
+    }
+
+    /// Returns what the subscribers wish together.
+    pub(crate) fn wished(&self) -> Wished {
+        self.shape.wished()
     }
 
     /// Sets the state of the type. Samples that waited for it are published or dropped.
