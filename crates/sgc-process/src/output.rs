@@ -106,5 +106,7 @@ mod tests {
             assert_eq!(bytes(n), text);
         }
         assert_eq!((millis(1239).as_str(), millis(12_390).as_str()), ("1.24 ms", "12 ms"));
+        assert_eq!(signed_millis(-1239, Some(500)), "-1.24 ms ± 0.50 ms");
+        assert_eq!(signed_millis(12_390, None), "12 ms");
     }
 }
