@@ -56,7 +56,7 @@ struct Peer {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ClockBounds {
     origin: Instant,
-    /// What the clock shows at the origin, at least and at most, in ns since 1970.
+    /// The least and the greatest time that the clock may show at the origin, in ns since 1970.
     at_origin: (i64, i64),
     /// The time of the answer that the bounds are of.
     measured: Instant,
@@ -187,7 +187,7 @@ mod tests {
     use super::*;
 
     const PEER: NodeId = NodeId([7; 32]);
-    /// What the clock of this node shows at the beginning, in ms since 1970.
+    /// The time that the clock of this node shows at the beginning, in ms since 1970.
     const OWN_MS: u64 = 1_700_000_000_000;
     const MS: i64 = 1_000_000;
 

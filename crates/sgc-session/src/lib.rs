@@ -1,5 +1,6 @@
 //! Decisions about the links of a node, and about the traffic that it starts by itself: keep-alive, back-off, bulk lanes,
-//! claims, candidates, port mappings, questions for types, shaping, dead-man switches. [`LinkSupervisor`] decides when a link is replaced.
+//! claims, candidates, port mappings, questions for types, shaping, the clocks of peers, dead-man switches.
+//! [`LinkSupervisor`] decides when a link is replaced.
 //!
 //! Pure machines: time and randomness are arguments, and nothing here opens a socket, spawns a task or waits.
 //! `sgc-node` observes, passes events in, and carries the results out.

@@ -34,7 +34,7 @@ impl Wished {
 pub struct Shaper {
     shaping: Shaping,
     limits: Pacer,
-    /// What the subscribers wish: messages that exceed it give way, reliable ones too, because nobody wants them.
+    /// The limit that the subscribers wish. Messages beyond it give way, reliable ones too, because nobody wants them.
     wished: Pacer,
     age: Age,
 }

@@ -7,8 +7,8 @@ use arc_swap::ArcSwap;
 use sgc_session::ClockBounds;
 use sgc_wire::SourceId;
 
-/// What is known of the clocks by which the messages of a sink are stamped. A publisher is taken to run by the clock of its
-/// node, though it may be on another host of that node's network.
+/// The known clocks by which the messages of a sink are stamped. A publisher is taken to run by the clock of its node,
+/// though it may be on another host of that node's network.
 #[derive(Default)]
 pub(crate) struct SourceClocks(ArcSwap<Known>);
 

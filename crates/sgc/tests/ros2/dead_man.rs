@@ -165,7 +165,7 @@ fn a_switch_without_automatic_end_waits_for_somebody_at_the_robot() {
     eventually("the stop message is repeated", || switch_of(&lab)["stops"].as_u64() > stops);
 }
 
-/// What fails while somebody drives.
+/// A fault while somebody drives.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Fault {
     CableCut,

@@ -43,7 +43,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Command::DeadMan { name, rule } => {
                 let sink = match self.shares.get(&name) {
-                    // What others publish on our own share comes to a sink of ours.
+                    // Messages of others on our own share come to a sink of ours.
                     Some(_) => Some(self.sinks.get_or_add_own(name)),
                     None => self.sinks.get(&name).cloned(),
                 };

@@ -12,7 +12,7 @@ const ASKED_NODES_MAX: usize = 256;
 /// The wishes of this node and of others.
 #[derive(Default)]
 pub(crate) struct Wishes {
-    /// What this node wants, with the owner of the topic.
+    /// The most that this node wants of each topic, with the topic's owner.
     own: BTreeMap<Name, (NodeId, Wished)>,
     is_own_changed: bool,
     asked: BTreeSet<NodeId>,
